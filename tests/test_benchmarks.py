@@ -223,6 +223,7 @@ def test_a_quick_tool_is_called_again_and_again_in_its_turn_and_the_last_call_co
     assert len(set(calls)) == 6  # no conductivity twice
 
 
+@pytest.mark.slow
 def test_a_slow_tool_stops_after_its_budget():
     call = np.copy, np.ones(3)
     turns = clock.interleaved([call, call], 9, budget=0.0)

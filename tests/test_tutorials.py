@@ -33,6 +33,7 @@ def close(found, expected):
     np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_a_disc_as_in_eidors(eidors):
     assert eidors["vh"].shape == (208,)
     assert (eidors["vh"] > 0).all()  # the polarity of '{ad}', '{ad}'

@@ -110,6 +110,7 @@ def test_what_is_done_is_skipped_until_the_session_or_an_option_changes(quick, s
     assert again(recipe=calib.Recipe(curve=calib.PowerLaw(900.0))) == 1
 
 
+@pytest.mark.slow
 def test_a_report_that_is_missing_is_written_and_an_old_one_does_not_stay(quick, sessions, tmp_path):
     out = tmp_path / "out"
     batch.calibrate_many(sessions[:1], out, executor=Here())

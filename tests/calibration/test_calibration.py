@@ -499,6 +499,7 @@ def test_an_untouched_frame_that_fits_no_sheet_is_said(model):
     assert "polarity" in note
 
 
+@pytest.mark.slow
 def test_images_are_those_of_the_sheet_that_the_untouched_frames_show(bundled):
     """The bundled bench has an uneven coat; images then are nearer to the presses than those of an even sheet."""
     with calib.open_session(bundled[0]) as session:

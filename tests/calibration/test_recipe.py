@@ -189,9 +189,8 @@ ITERATIVE = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "sparse Bayes")) for name in ITERATIVE]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ITERATIVE)
 def test_a_calibration_with_an_iterative_method_is_kept_in_the_file(name, grid, folder):
     imaging = ITERATIVE[name]
     with calib.open_session(grid) as session:

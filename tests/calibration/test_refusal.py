@@ -130,6 +130,7 @@ class Here(Executor):
         return done
 
 
+@pytest.mark.slow
 def test_a_batch_refuses_too(reversed_, sound, tmp_path, calibration):
     paths = [sound, reversed_]
     good, bad = calibrate_many(paths, tmp_path, recipe=QUICK, executor=Here())

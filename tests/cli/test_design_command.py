@@ -85,6 +85,7 @@ def test_a_designed_skin_is_simulated_and_checked(tmp_path, monkeypatch, capsys)
         np.testing.assert_array_equal(je.skin.parse_skin(session.skin_toml).protocol.pattern, better.protocol.pattern)
 
 
+@pytest.mark.slow
 def test_a_design_for_several_sense_channels(tmp_path, monkeypatch, capsys):
     """Six times of a reading, three readings at once; the session's readings have the times that the skin says."""
     monkeypatch.chdir(tmp_path)
@@ -104,6 +105,7 @@ def test_a_design_for_several_sense_channels(tmp_path, monkeypatch, capsys):
     assert "sense_channels" not in (tmp_path / "again.toml").read_text()
 
 
+@pytest.mark.slow
 def test_a_design_moves_electrodes(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.toml").write_text(SKIN)

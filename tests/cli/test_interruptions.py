@@ -76,7 +76,7 @@ def commands(bundled, calibrated, tmp_path_factory):
 
 QUICK = [(name, fault) for name in ("import", "recover") for fault in FAULTS]
 LONG = [(name, fault) for name in ("simulate", "calibrate", "apply") for fault in ("SIGTERM", "disk full")]
-REPORT = [("report", "disk full"), pytest.param("report", "SIGTERM", marks=pytest.mark.slow)]
+REPORT = [pytest.param("report", fault, marks=pytest.mark.slow) for fault in ("SIGTERM", "disk full")]
 
 
 @pytest.mark.parametrize(("name", "fault"), QUICK + LONG + REPORT)

@@ -167,6 +167,7 @@ def test_a_scan_too_long_for_a_journal_is_refused(sessions):
         replace(plan, mixing=((0, 0, 1.0),) * 25_001)
 
 
+@pytest.mark.slow
 def test_forces_are_as_with_the_adjacent_scan(calibrated, capsys):
     """The pads tell the force with either scan; that of the image alone is as good, and so is the place."""
     found, sessions = {}, calibrated
@@ -189,6 +190,7 @@ def test_forces_are_as_with_the_adjacent_scan(calibrated, capsys):
     assert through_all["localisation_half_mean"] < pairs["localisation_half_mean"]
 
 
+@pytest.mark.slow
 def test_errors_of_forces_hold_the_noise_of_single_readings(calibrated):
     """Curves are fitted to means over parts of presses, which scatter less than readings do."""
     model = calib.load_calibration(calibrated / "cal-adjacent.h5")

@@ -164,6 +164,7 @@ def test_many_frames_mapped_wait_for_no_thread(single):
     assert not spread_stacks(jax.jit(jax.vmap(single)).lower(frames).as_text())
 
 
+@pytest.mark.slow
 def test_other_devices_search_so_many_frames_side_by_side(single, linear, monkeypatch):
     frames = np.stack([0.02 * linear((0.05 + 0.02 * k, 0.08), 0.01) for k in range(5)]) + _noise(5)
     alone = single(frames)

@@ -260,10 +260,12 @@ def test_a_thousand_frames_are_those_of_python(case, calibration, recorded, tmp_
 
 
 PLACED_CASES = [*((name, "half") for name in FIELD_FORMULAS), *(("edge", n) for n in ("peak", "quarter", "positive"))]
+QUICK_CASES = {("edge", "half"), ("edge", "peak"), ("edge-spline", "half"), ("rbf", "half"), ("gp", "half")}
+PLACED = [case if case in QUICK_CASES else pytest.param(*case, marks=pytest.mark.slow) for case in PLACED_CASES]
 
 
 @needs_compiler
-@pytest.mark.parametrize(("field", "place"), PLACED_CASES)
+@pytest.mark.parametrize(("field", "place"), PLACED)
 def test_a_correction_by_location_is_that_of_python(field, place, calibration, recorded, tmp_path):
     chosen = located(calibration, FIELDS.make(field), place)
     sizes = calib.export_c(chosen, tmp_path / "skin.h")
@@ -278,6 +280,7 @@ def test_a_correction_by_location_is_that_of_python(field, place, calibration, r
     assert sizes.flash - plain.flash == 4 * (3 * 400 + 4 * 4 * sides + 2 * 4 * 4 + 4 * rim + 4 * numbers)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("field", ["edge", "edge-spline", "rbf", "gp"])
 def test_a_field_with_other_settings_is_that_of_python(field, calibration, recorded, tmp_path):
@@ -342,6 +345,7 @@ def test_places_of_the_image_stand_in_for_fits_and_what_it_changes_is_told(calib
     assert "at the place of the image by the estimator 'half'" in header
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_more_missing_readings_than_there_is_room_for(calibration, recorded, tmp_path):
     """The image is then unknown, and the forces are spread evenly; with more room the image is that of Python."""

@@ -130,6 +130,7 @@ def on_a_loop(noise: float, width: float):
     return pressure, np.asarray(force) + side
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("groups", [None, GROUPS], ids=["blocks", "presses"])
 def test_a_spline_is_as_bent_as_the_samples_that_err_for_themselves_can_tell(groups):
     """The rounds written out, by normal equations: a bend counts against as many samples as err together."""
@@ -493,5 +494,6 @@ def test_the_simplest_of_those_that_are_as_good_is_chosen_and_said():
     assert simplest("curve", tried, lambda name: np.array(squares[name]), "places")[0] == "free"
 
 
+@pytest.mark.slow
 def test_where_there_is_no_choice_nothing_is_scored():
     assert simplest("curve", [Tried(1, "one", 1)], lambda _: pytest.fail("scored"), "places") == (1, "", ())

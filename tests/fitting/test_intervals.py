@@ -172,6 +172,7 @@ def _covered(model, new, sites, result):
     return half.mean()
 
 
+@pytest.mark.slow
 def test_a_scale_moves_no_force_and_ends_at_the_errors_of_an_unknown_place(skin):
     rng = np.random.default_rng(5)
     sites = rng.uniform(0.01, 0.19, (60, 2))

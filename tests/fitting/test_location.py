@@ -346,6 +346,7 @@ def test_presses_that_leave_out_the_borders_bound_what_is_said_of_them(skin, geo
         assert abs(log_gain(free, border).mean[0, 0]) > 1  # what the coefficients alone would say
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("place", "told"), [(grid(12), "10 to 25 mm"), (jittered(64, 5), ""), (grid(2), "")])
 def test_distances_to_walls_without_presses_are_told(skin, geometry, place, told):
     share, places = np.eye(4)[owner(place)], single_places(place, 4)

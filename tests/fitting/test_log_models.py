@@ -30,6 +30,7 @@ def fitted(log):
     return fit_series(series, series.complete, [Affine()], ways_of(1, 128), Squared())
 
 
+@pytest.mark.slow
 def test_standard_errors_and_intervals_of_autocorrelated_logs_are_honest():
     """Pulls of 40 logs have a standard deviation of one; as independent samples they would have four."""
     found = [fitted(autocorrelated(seed)) for seed in range(40)]
@@ -69,6 +70,7 @@ def test_noise_that_grows_with_the_rate_is_recovered_and_covered():
     assert ((np.mean(covered, 0) > 0.88) & (np.mean(covered, 0) < 0.99)).all()
 
 
+@pytest.mark.slow
 def test_a_log_that_begins_under_load_holds_its_unknown_history_in_its_interval():
     """Cycles of a curve with hysteresis, cut at any sample: forces lie in the intervals, which narrow in a cycle."""
     curve, n = AffinePlay(np.array([0.2, 0.4, 0.8])), 2400

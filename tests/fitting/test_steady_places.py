@@ -96,6 +96,7 @@ def test_a_round_sheet_has_averages_too(skin):
     assert np.sqrt(np.mean(left**2)) < 0.5 * ERROR
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_forces_between_the_lines_of_a_grid_do_not_show_the_errors_of_single_places(skin, seed):
     """Places of one line that seem to lie at several distances flatten a field there, and lift it between the lines."""

@@ -32,7 +32,7 @@ def judged(found, count):
 
 
 def test_some_lies(root):
-    judged(campaign(20, 1, root, 600), 20)
+    judged(campaign(10, 1, root, 600), 10)
 
 
 @pytest.mark.slow

@@ -51,7 +51,7 @@ def judged(found):
 def test_some_spoilt_inputs(tmp_path, root):
     """Of the kinds whose readers compile nothing."""
     compiled = {"calibration", "hostile calibration", "reconstructor", "hostile reconstructor"}
-    judged(campaign([kind for kind in READERS if kind not in compiled], 40, 1, tmp_path, root, 100))
+    judged(campaign([kind for kind in READERS if kind not in compiled], 15, 1, tmp_path, root, 100))
 
 
 @pytest.mark.slow

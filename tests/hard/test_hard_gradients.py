@@ -577,11 +577,7 @@ def test_float32_stays_float32(single, name):
     assert all(product.params["precision"] == (HIGHEST, HIGHEST) for product in products(program.jaxpr))
 
 
-# Which matrices a method factors hangs on the method, not on what varies.
-_ALIKE = {name for name in CASES if name.startswith(("prepare, noise", "prepare, hyperparameter"))}
-
-
-@pytest.mark.parametrize("name", _marked(_ALIKE))
+@pytest.mark.parametrize("name", _marked(SLOW - {"prepare, conductivity"}))
 def test_no_stack_of_matrices_is_spread_over_threads_that_wait_for_it(tiny, name):
     """However many are mapped at once; see `jaxeit.linalg.lapack`."""
     case = CASES[name](tiny)

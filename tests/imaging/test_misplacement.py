@@ -50,6 +50,7 @@ def _untouched(seed, aside, coat):
     return frame + noise * own.standard_normal(frame.shape), np.full(frame.shape, noise)
 
 
+@pytest.mark.slow
 def test_misplaced_bolts_are_told_from_an_uneven_coat(model):
     """Frames of another program; readings that are missing are left out."""
     honest = find_misplacement(model, *_untouched(8101, 0.0, 0.4))

@@ -67,6 +67,7 @@ def test_variation_does_not_ask_which_way_an_edge_runs(coarse):
     np.testing.assert_allclose(list(cost.values()), 2 * np.array(length), rtol=0.07)
 
 
+@pytest.mark.slow
 def test_variation_means_the_same_in_tanks_of_any_size():
     """The same image and readings relative to their errors, in a tank of a tenth of the size and conductivity."""
     found = []

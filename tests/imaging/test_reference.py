@@ -83,6 +83,7 @@ def test_level_and_contacts_within_their_errors(saline):
     assert 0.6 < np.std(levels) < 1.4
 
 
+@pytest.mark.slow
 def test_what_a_draft_mesh_leaves_is_in_the_errors(saline):
     """Contacts of the driven electrodes, readings all but free of noise: the error is that of the mesh."""
     model = _tank(je.Protocol.from_matrices(CURRENT * RING, RING), edge_length=0.06)
@@ -96,6 +97,7 @@ def test_what_a_draft_mesh_leaves_is_in_the_errors(saline):
     assert np.sqrt(np.mean(np.square(contacts))) < 1.3
 
 
+@pytest.mark.slow
 def test_what_a_mesh_misses_near_electrodes_is_in_the_errors(saline):
     """Good contacts, of which the mesh misses more than readings all but free of noise do."""
     model = _tank(je.Protocol.from_matrices(CURRENT * RING, RING), edge_length=0.06)
@@ -109,6 +111,7 @@ def test_what_a_mesh_misses_near_electrodes_is_in_the_errors(saline):
     np.testing.assert_allclose(jnp.sqrt(jnp.diag(fit.covariance))[1:17], fit.standard_error.contact)
 
 
+@pytest.mark.slow
 def test_an_offset_of_the_readings_is_named_and_fitted(saline, adjacent):
     """As in the tank of PyEIDORS: damped steps did not end, and the refusal did not say why."""
     _, potential = saline(12, np.eye(COUNT) - 1 / COUNT)
@@ -184,6 +187,7 @@ def test_electrodes_that_sit_elsewhere(adjacent):
     assert len(fit.untold) > COUNT // 2  # shifts across the rim do nothing
 
 
+@pytest.mark.slow
 def test_what_cannot_be_fitted_is_refused(adjacent):
     frame = je.forward(adjacent)
     with pytest.raises(InverseError, match="give the 208 readings"):

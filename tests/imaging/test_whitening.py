@@ -51,6 +51,7 @@ def test_readings_weigh_by_the_inverse_of_their_noise(noisy):
     np.testing.assert_allclose(recon.matrix, expected, atol=1e-8 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_images_know_what_amplifiers_make_of_the_common_mode(model, pixels):
     """With readings that are no differences, and a NaN: the same image as by the Jacobian of all readings."""
     amplified = replace(model, effects=(je.effects.CommonMode(gain=8e-3),))

@@ -61,6 +61,7 @@ def test_scenes_have_pairs_edges_and_skins_of_all_strengths(skin, frames):
         RandomScenes(near=2)
 
 
+@pytest.mark.slow
 def test_targets_are_the_contacts_or_their_moments(frames):
     found = targets_of(frames)
     order = np.argsort(-frames["contact_force"], axis=1)

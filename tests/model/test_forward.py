@@ -61,6 +61,7 @@ def test_four_terminal_readings_do_not_feel_the_contact():
 DRAFT = je.Fidelity(edge_length=0.06, growth=1.6, solver=Dense())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fidelity", [je.Fidelity.draft(edge_length=0.1), je.Fidelity.draft(edge_length=0.1, order=2)])
 def test_a_contact_that_four_terminal_readings_feel_is_resolved(fidelity):
     """Transfer length 0.8 mm, triangles of 2.9 mm: the error is that of the mesh with perfect contacts, and less than

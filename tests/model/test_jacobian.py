@@ -111,6 +111,7 @@ def test_a_new_conductivity_compiles_nothing(small, compilations):
     assert not compilations
 
 
+@pytest.mark.slow
 def test_factors_in_single_precision_give_a_jacobian_of_the_models_precision():
     single = je.Fidelity.draft(solver=je.linalg.Single(je.linalg.NestedDissection()))
     scene, basis = je.Scene(je.load_skin("testbed")), je.Pixels(8)

@@ -137,6 +137,7 @@ def test_the_named_scan_against_the_disc_in_closed_form():
     assert (np.diff(resistance[:8]) < 0).all()
 
 
+@pytest.mark.slow
 def test_contacts_are_found(trigonometric):
     model = trigonometric
     inside = jnp.linalg.norm(model.centroids - jnp.array([0.03, -0.02]), axis=1) < 0.02
@@ -197,6 +198,7 @@ def test_no_electrode_around_the_rim_is_refused():
         je.skin.rim_electrodes(DISC, 0)
 
 
+@pytest.mark.slow
 def test_rim_electrodes_are_where_they_are_asked_for():
     square = je.Polygon(np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]))
     top = je.skin.rim_electrodes(square, 8, 0.1, start=np.pi / 2, clockwise=True)

@@ -35,7 +35,13 @@ MODELS = {
 }
 
 
-@pytest.fixture(scope="module", params=MODELS)
+QUICK = {"complete bolts", "bolts on a sphere", "perfect patches"}
+
+
+@pytest.fixture(
+    scope="module",
+    params=[name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in MODELS],
+)
 def case(request):
     model = MODELS[request.param]()
     shift = np.random.default_rng(0).normal(size=(model.electrodes, 2))
@@ -145,6 +151,7 @@ def test_a_disc_that_turns_reads_the_same():
     assert float(jnp.abs(across).max()) < 1e-5 * float(jnp.abs(one).max())  # electrodes do not leave the rim
 
 
+@pytest.mark.slow
 def test_moved_models_have_jacobians_and_second_derivatives():
     model = square_model(POINTS, [[0, 1, 2, 3]], 8)
     motion, basis = electrode_motion(model), je.Elements().on(model)
@@ -188,6 +195,7 @@ def test_what_cannot_be_moved_is_refused(skin):
         electrode_motion(coated)
 
 
+@pytest.mark.slow
 def test_readings_of_any_currents_move_too():
     """Trigonometric currents: each reading is a sum over readings of four electrodes."""
     angle = 2 * np.pi * np.arange(8) / 8

@@ -476,6 +476,7 @@ def test_the_calibrated_force_has_a_third_map_where_it_is_not_the_papers(calibra
     assert third.collections[0].get_array().ravel()[0] == pytest.approx(expected[:2].mean() / expected.mean())
 
 
+@pytest.mark.slow
 def test_a_layer_that_was_learned_has_two_maps(located, written, tmp_path):
     """They are the field's own mean and deviation, and nothing is drawn off the sheet."""
     corners = np.array([[0.0, 0.0], [0.2, 0.2]])
@@ -496,6 +497,7 @@ def test_a_layer_that_was_learned_has_two_maps(located, written, tmp_path):
     assert np.isnan(gain.ravel()[~there]).all()
 
 
+@pytest.mark.slow
 def test_a_curved_sheet_is_drawn_in_space_and_a_flat_one_is_not(located, written, tmp_path):
     """As a cylinder: places, cells and maps lie on it."""
     curved = replace(located.skin, surface=je.geometry.Cylinder(0.3, 0.1))

@@ -349,6 +349,7 @@ def test_other_files_are_refused(tmp_path, name, content, message):
         load_tank(tmp_path / name, je.Disc(RADIUS))
 
 
+@pytest.mark.slow
 def test_the_page_goes_from_a_file_to_a_picture(bench, tmp_path, root, monkeypatch, capsys):
     """At most ten lines; the same from the command line."""
     page = root / "docs" / "tanks.md"
@@ -399,6 +400,7 @@ def test_the_page_on_a_real_tank(root, tmp_path, monkeypatch):
         assert sign * float(jnp.mean(found.change[near])) > 0.2, number
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not KTC.exists(), reason="ktc2023 is not at hand; set JAXEIT_REAL_DATA to its folder")
 def test_matrices_of_the_kuopio_challenge_explain_its_water():
     tank = load_tank(KTC)
@@ -433,6 +435,7 @@ def test_one_frame_shows_the_conductivity(bench, tmp_path, capsys):
         calib.tanks.conductivity_image(tank, 2)
 
 
+@pytest.mark.slow
 def test_an_offset_that_is_fitted_is_taken_from_the_frames(bench, tmp_path, capsys):
     offset = 0.35 * np.sqrt(np.mean(bench.frames**2))
     path, args = tmp_path / "offset.npz", ["--radius", str(RADIUS), "-o", str(tmp_path / "offset.png")]

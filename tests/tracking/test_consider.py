@@ -108,6 +108,7 @@ def coats(model):
     return 0.15 * field_modes(np.asarray(model.centroids), 0.03)
 
 
+@pytest.mark.slow
 def test_slopes_in_the_coat_are_those_of_the_forward_map(model, even_tracker, coats):
     """But for the few unknowns that are solved anew."""
     sheet, one = even_tracker.filter.sheet, jnp.array(load(0.08, 0.11, 15.0))
@@ -127,6 +128,7 @@ def test_slopes_in_the_coat_are_those_of_the_forward_map(model, even_tracker, co
     assert jnp.linalg.norm(along @ found - wanted) < 0.25 * jnp.linalg.norm(wanted)
 
 
+@pytest.mark.slow
 def test_a_sheet_that_is_known_has_no_unknown_coat(model, skin, blank, tracker, even_tracker):
     """Nor has one of which the settings say so."""
     assert 0.08 < float(even_tracker.filter.coat_error) < 0.16

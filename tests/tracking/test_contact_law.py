@@ -131,6 +131,7 @@ def test_a_share_that_is_none_is_refused():
         ContactLaw.unknown().aged(-0.1)
 
 
+@pytest.mark.slow
 def test_pads_tell_the_contacts_that_lie_on_them(tracker):
     """Pads of the testbed are its quarters: one of them is dead."""
     on = tuple(track(5.0, 0.01, place=place) for place in ((0.05, 0.05), (0.15, 0.05), (0.1, 0.05), (0.05, 0.15)))

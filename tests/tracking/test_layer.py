@@ -80,6 +80,7 @@ def test_nothing_learned_is_the_prior(tracker):
     np.testing.assert_array_equal(tracker.start(layer).belief.covariance, tracker.start().belief.covariance)
 
 
+@pytest.mark.slow
 def test_presses_of_known_force_tell_the_gain_where_they_are(layer):
     at = np.array([*PLACES, (0.15, 0.15)])
     mean, deviation = layer.at(at)
@@ -89,6 +90,7 @@ def test_presses_of_known_force_tell_the_gain_where_they_are(layer):
     assert deviation[:3].max() < 0.5 * deviation[3]
 
 
+@pytest.mark.slow
 def test_presses_one_by_one_tell_the_gain_too(tracker, frame_of):
     """Frames by themselves, at the same places: the gain is told within what is stated, and then the force."""
     known = None
@@ -105,6 +107,7 @@ def test_presses_one_by_one_tell_the_gain_too(tracker, frame_of):
     assert errors[1] < min(0.5 * errors[0], 0.06)
 
 
+@pytest.mark.slow
 def test_a_press_between_the_wrong_bolts_is_begun_elsewhere(tracker, frame_of, monkeypatch):
     """The best atom may be 20 mm off; from there the fit ends off the sheet, or with another width."""
     true = np.array([0.15, 0.12])
@@ -155,6 +158,7 @@ def told_directions(tracker, seed, count):
         yield along.T @ (np.asarray(found.gain) - gain) / np.sqrt(left)
 
 
+@pytest.mark.slow
 def test_a_press_states_the_error_of_the_gain_under_it(model, skin, blank):
     """Where the model is right, in intervals of 90 %, with the reach that trackers have.
 
@@ -168,6 +172,7 @@ def test_a_press_states_the_error_of_the_gain_under_it(model, skin, blank):
     assert 0.8 < np.mean(pulls**2) < 1.5
 
 
+@pytest.mark.slow
 def test_the_gain_for_fits_of_loads_is_that_of_the_next_press(layer):
     """Its covariance is that of the layer and an effect of the press."""
     points = np.array(PLACES)
@@ -322,6 +327,7 @@ def test_errors_of_sheet_and_mesh_do_not_matter_where_nothing_was_told():
     np.testing.assert_array_equal(flat.errors(), np.concatenate([np.ones((8, 2)), np.zeros((8, 7))], 1))
 
 
+@pytest.mark.slow
 def test_a_sheet_that_is_wrong_looks_like_gain(model, tracker):
     """The true gain is one everywhere. On one side of the sheet the conductivity is 2 % higher than the tracker's sheet
     has it, and as much lower on the other. Presses of known force then teach the gain that is foreseen."""

@@ -164,9 +164,8 @@ def test_distances_from_loads_are_those_from_their_lines():
     np.testing.assert_allclose(np.sqrt(squares_to_lines(middles, places, halves)), sampled, rtol=1e-3, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "side", [pytest.param(0.08, marks=pytest.mark.slow), 0.12, pytest.param(0.3, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("side", [0.08, 0.12, 0.3])
 def test_a_contact_is_as_wide_on_a_small_sheet(side):
     """An image of as many pixels on every sheet would leave out the tails of a load on a small one."""
     grid = [[x * side, y * side] for x in (0.2, 0.5, 0.8) for y in (0.2, 0.5, 0.8)]

@@ -152,6 +152,7 @@ def test_wrong_settings_are_refused(wrong):
         TrackerSettings(**wrong)
 
 
+@pytest.mark.slow
 def test_pixels_beside_a_sheet_that_is_no_rectangle_have_no_response(cornered):
     sheet = cornered.filter.sheet
     beside = np.asarray(sheet.pad_area).sum(1) == 0

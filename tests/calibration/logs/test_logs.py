@@ -213,6 +213,7 @@ def test_errors_and_coverage_by_hand():
     assert np.isnan(s["coverage_middle"])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_way")
 def test_a_log_that_only_loads_says_that_hysteresis_is_not_in_its_intervals(tmp_path, capsys):
     """Filled in the first half and emptied in the second: neither direction is in what the other is tried on."""
