@@ -20,6 +20,9 @@ ellipses: such tips on other sheets, fitted as single loads only: ellipses and i
 the root of the product of the half axes of the ellipse. A case lies outside of 85 to 95 % beyond chance where frames
 that err apart from one another would show so few or so many covered in 2.5 %.
 
+round: settings of the fit for a skin that only round tips touch (`LoadSettings.round_tips`), beside the usual ones, on
+further sheets: singles and near pairs, and tips of the shapes above, which these settings do not know.
+
 chest: the same singles, pairs and edges on a curved skin.
 """
 
@@ -45,6 +48,7 @@ from .rows import Row, grouped, rounded
 
 LOAD = 20.0  # N
 DISTANCES, SHARES = (0.015, 0.02, 0.025, 0.03, 0.04), (1.0, 1 / 3)
+NEAR = (0.012, 0.015, 0.02, 0.025, 0.03)  # m, of pairs where only round tips touch
 LENGTHS = (0.02, 0.03, 0.04, 0.06)
 TRIANGLE = 0.025  # m, from its middle to each of three tips
 TIPS = 19  # of a touch at most
@@ -76,14 +80,7 @@ class Touch(NamedTuple):
 
 def touches(rng: np.random.Generator, singles: int, others: int, low: np.ndarray, high: np.ndarray) -> Iterator[Touch]:
     """All touches of a seed, on a sheet whose corners are at low and high."""
-    for place in rng.uniform(low + 0.02, high - 0.02, (singles, 2)):
-        yield _touch("one", LoadKind.ONE, place[None], np.array([LOAD]))
-    for share in SHARES:
-        for distance in DISTANCES:
-            for middle, along in _lines(rng, others, low, high):
-                places = middle + np.array([[-0.5], [0.5]]) * distance * along
-                name = f"two, 1:{1 / share:.0f}, {1e3 * distance:.0f} mm"
-                yield _touch(name, LoadKind.TWO, places, LOAD * np.array([1.0, share]))
+    yield from round_touches(rng, singles, others, DISTANCES, low, high)
     for length in LENGTHS:
         for middle, along in _lines(rng, others, low, high):
             places = middle + np.linspace(-0.5, 0.5, 9)[:, None] * length * along
@@ -92,6 +89,25 @@ def touches(rng: np.random.Generator, singles: int, others: int, low: np.ndarray
         turned = np.exp(2j * np.pi * np.arange(3) / 3) * complex(*along)
         places = middle + TRIANGLE * np.stack([turned.real, turned.imag], 1)
         yield _touch("three", LoadKind.MORE, places, np.full(3, LOAD))
+
+
+def round_touches(
+    rng: np.random.Generator,
+    singles: int,
+    others: int,
+    distances: tuple[float, ...],
+    low: np.ndarray,
+    high: np.ndarray,
+) -> Iterator[Touch]:
+    """Singles, and pairs at some distances."""
+    for place in rng.uniform(low + 0.02, high - 0.02, (singles, 2)):
+        yield _touch("one", LoadKind.ONE, place[None], np.array([LOAD]))
+    for share in SHARES:
+        for distance in distances:
+            for middle, along in _lines(rng, others, low, high):
+                places = middle + np.array([[-0.5], [0.5]]) * distance * along
+                name = f"two, 1:{1 / share:.0f}, {1e3 * distance:.0f} mm"
+                yield _touch(name, LoadKind.TWO, places, LOAD * np.array([1.0, share]))
 
 
 def _lines(
@@ -188,7 +204,14 @@ class Prepared(NamedTuple):
     bumps: Any
 
 
-def prepared(model: je.Model, found: Pressed, seed: int, decibels: int, known: bool) -> Prepared:
+def prepared(
+    model: je.Model,
+    found: Pressed,
+    seed: int,
+    decibels: int,
+    known: bool,
+    settings: je.contacts.LoadSettings | None = None,
+) -> Prepared:
     """Fitter and frames, with noise so many decibels below the readings, the sheet known or not."""
     rng = np.random.default_rng([seed, decibels, known])
     found = found._replace(noise=found.noise * 10 ** ((60 - decibels) / 20))
@@ -196,7 +219,7 @@ def prepared(model: je.Model, found: Pressed, seed: int, decibels: int, known: b
     noise = found.std
     sheet = je.fit_background(model, blank) if known else None
     finder = je.prepare_contacts(model, noise=noise, sigma=sheet)
-    fitter: LoadFitter = je.contacts.prepare_loads(model, noise=noise, sigma=sheet)
+    fitter: LoadFitter = je.contacts.prepare_loads(model, settings, noise=noise, sigma=sheet)
     return Prepared(fitter, frames, finder(frames))
 
 
@@ -330,6 +353,26 @@ def told_kinds(stated: list[np.ndarray], true: list[np.ndarray]) -> Iterator[Row
         }
 
 
+def measure_round(run: Run) -> Iterator[Row]:
+    seeds, singles, others, distances = run.sizes((6, 8, 3, NEAR), (1, 1, 1, NEAR[:1]))
+    model, every = fit_model(), []
+    low, high = (np.asarray(model.chart, float).min(0), np.asarray(model.chart, float).max(0))
+    for seed in range(FIRST_SEED + 110, FIRST_SEED + 110 + seeds):
+        rng = np.random.default_rng(seed)
+        parts = [(list(round_touches(rng, singles, others, distances, low, high)), 0.012)]
+        parts += [(list(chain(*(shaped(rng, shape, others) for shape in SHAPES[1:]))), TIP_SPREAD)]
+        frames = [simulated(seed, given, spread=spread) for given, spread in parts]
+        found = frames[0]._replace(change=np.concatenate([part.change for part in frames]))
+        given = [touch for some, _ in parts for touch in some]
+        usual, of_round = (
+            [judged(one) for one in seen(prepared(model, found, seed, 60, True, settings), given)]
+            for settings in (None, je.contacts.LoadSettings.round_tips())
+        )
+        every += [row | {"usually": other["told"]} for row, other in zip(of_round, usual, strict=True)]
+        print(f"seed {seed}", flush=True)
+    yield {"round": [{"touch": row.pop("name")} | row for row in means(every, "name")]}
+
+
 def measure_coverage(run: Run) -> Iterator[Row]:
     seeds, count = run.sizes((4, 8), (1, 1))
     yield {"coverage": means(list(_cases(range(FIRST_SEED + 50, FIRST_SEED + 50 + seeds), count, _told)), "case")}
@@ -416,6 +459,7 @@ def picture(data: Row) -> Figure:
 PARTS = {
     "kinds": measure_kinds,
     "drawn": measure_drawn,
+    "round": measure_round,
     "coverage": measure_coverage,
     "ellipses": measure_ellipses,
     "chest": measure_chest,

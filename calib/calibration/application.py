@@ -1,6 +1,7 @@
 """Applying a calibration to a session: the force map of every frame, in a file."""
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from .calibration import Calibration
 from .force_maps import USED, ForceEstimate
 from .frame_blocks import FrameBlock, FrameBlocks, Progress, estimated
 from .localisation.contact_tracks import ABOUT, ContactTracks, NotFollowed, quiet_tracker
-from .localisation.load_windows import WindowedFrames, fit_windows
+from .localisation.load_windows import SeenLoads, WindowedFrames, fit_windows
 from .localisation.proposals import ProposalChoice, chosen_proposal
 from .places_in_space import normals_in_space, pad_centres, points_in_space
 from .recalibration.agreement import agreement_of_use
@@ -37,6 +38,7 @@ def apply(
     progress: Progress = iter,
     loads: float | None = None,
     proposal: ProposalChoice = je.contacts.shipped_proposal,
+    load_settings: je.contacts.LoadSettings | None = None,
     track: bool = False,
     tell: Callable[[str], object] = lambda line: None,
 ) -> Path:
@@ -52,6 +54,8 @@ def apply(
         loads: also tell what touches the skin, none, one, two, an edge or more, in windows of so many s; None: do not.
         proposal: of loads, trained for this skin by ``jaxeit train``, where their fits begin; default: the one that is
             shipped for the skin, and a search where there is none; None: a search.
+        load_settings: what is known of loads before a frame; default: the usual. With others, fits begin by a search
+            unless a proposal is given, since the shipped ones were trained on the usual loads.
         track: also follow contacts from frame to frame, each with a number; smoothed over time.
         tell: called with a line about loads, about contacts, and about each thing outside of what was calibrated.
 
@@ -61,6 +65,8 @@ def apply(
         RecordingError: if `check_session` finds an error in its skin, frames or pressures.
     """
     processing = processing or calibration.processing
+    if load_settings is not None and proposal is je.contacts.shipped_proposal:
+        proposal = None
     proposed = chosen_proposal(proposal, calibration.skin, tell) if loads is not None else None
     levels = resting_levels(session, calibration.skin, processing)
     ignored = accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED)
@@ -71,7 +77,10 @@ def apply(
     blocks = FrameBlocks(session, processing, levels)
     with ArchiveWriter(path, FORMAT, {name: value for name, value in attrs.items() if value != ""}) as writer:
         kinds = _begin_rows(writer, calibration, session.epoch)
-        also: list[_Loads | _Tracks] = [] if loads is None else [_Loads(calibration, writer, loads, progress, proposed)]
+        also: list[_Loads | _Tracks] = []
+        if loads is not None:
+            fit = partial(fit_windows, calibration, progress=progress, proposal=proposed, settings=load_settings)
+            also += [_Loads(calibration, writer, loads, fit)]
         also += [_Tracks(calibration, writer, blocks)] if track else []
         for block, found in estimated(calibration, progress(blocks)):
             _append(writer, _of_block(block.time, found, calibration.pads.multiple), kinds)
@@ -172,10 +181,9 @@ class _Loads:
         calibration: Calibration,
         writer: ArchiveWriter,
         seconds: float,
-        progress: Progress,
-        proposal: je.contacts.Proposal | None,
+        fit: Callable[[WindowedFrames], SeenLoads],
     ):
-        self._calibration, self._writer, self._progress, self._proposal = calibration, writer, progress, proposal
+        self._calibration, self._writer, self._fit = calibration, writer, fit
         self._windows = WindowedFrames(seconds, calibration.recon.readings)
 
     def add(self, block: FrameBlock, found: ForceEstimate) -> None:
@@ -185,7 +193,7 @@ class _Loads:
     def end(self) -> str:
         """Write the loads; returns what they are in one line."""
         self._windows.close()
-        seen = fit_windows(self._calibration, self._windows, self._progress, self._proposal)
+        seen = self._fit(self._windows)
         for name, about in seen.arrays.items():
             self._writer.add(LOADS + name, *about)
         return seen.render()

@@ -98,6 +98,11 @@ def test_two_contacts_are_told_over_time(session, tmp_path, capsys):
     share = np.take_along_axis(force[both, :2], order, 1)[near]
     np.testing.assert_allclose(share, np.tile([15.0, 10.0], (len(share), 1)), rtol=0.25)
     assert np.isnan(arrays["loads/distance"]).all()
+    assert main([*searching[:-2], "--round-tips"]) == 0
+    of_round = calib.session.read_archive(out, "skin-forcemap").arrays
+    assert np.isnan(of_round["loads/distance"]).all()  # no network, which was trained on tips of all shapes
+    assert (of_round["loads/probability"][both, 2] > 0.9).all()
+    assert not of_round["loads/probability"][:, 3].any()
     assert main([*searching[:-2], "--report", str(tmp_path / "r.html")]) == 0  # the shipped network, by default
     assert "What touched the skin" in (tmp_path / "r.html").read_text()
     proposed = calib.session.read_archive(out, "skin-forcemap").arrays
@@ -107,6 +112,18 @@ def test_two_contacts_are_told_over_time(session, tmp_path, capsys):
     order = np.argsort(proposed["loads/position"][told, :2, 0], axis=1)
     pair = np.take_along_axis(proposed["loads/position"][told, :2], order[..., None], 1)
     assert np.linalg.norm(pair - sites, axis=2).min(0).max() < 0.004
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ((), "--round-tips: it is about fits of loads; add --loads SECONDS"),
+        (("--loads", "1", "--proposal", "p.npz"), "trained on tips of all shapes; leave out one of the two"),
+    ],
+)
+def test_what_round_tips_need_is_said_first(options, message, tmp_path, capsys):
+    assert main(["apply", "c.h5", "s.h5", "-o", str(tmp_path / "map.h5"), "--round-tips", *options]) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_the_shipped_network_is_chosen_by_the_skin(skin):

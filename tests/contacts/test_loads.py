@@ -46,6 +46,23 @@ def test_what_touches_the_sheet_is_told(ready, number):
     np.testing.assert_allclose(np.sort(best.force), np.sort(forces), rtol=0.35)
 
 
+def test_near_tips_are_told_apart_where_only_round_ones_touch(ready):
+    """A flat or a long tip would explain them; one tip stays one."""
+    fitter, finder, _, _ = ready
+    frames, noise, blank = frames_of([pair(0.1, 0.08, 0.02, 0.7), single(0.06, 0.13)], seed=4)
+    usual = fitter(frames[0], finder(frames[0]))
+    assert usual.kind is not LoadKind.TWO
+    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    of_round = prepare_loads(model, LoadSettings.round_tips(), noise=noise, untouched=blank)
+    two, one = (of_round(frame, finder(frame)) for frame in frames)
+    assert two.kind is LoadKind.TWO
+    assert two.probability[LoadKind.TWO] > 0.9
+    assert two.probability[LoadKind.EDGE] == 0
+    away = np.linalg.norm(np.asarray(two.two.position)[:, None] - pair(0.1, 0.08, 0.02, 0.7)[0], axis=2)
+    assert away.min(0).max() < 0.003
+    assert one.probability[LoadKind.ONE] > 0.9
+
+
 @pytest.mark.parametrize("touch", [ring(0.08, 0.11, 0.015), tilted(0.11, 0.09, 0.5, 0.8)], ids=["ring", "tilted tip"])
 def test_a_tip_that_is_no_gaussian_is_one(ready, touch):
     """Two loads near one another explain these frames better than a Gaussian does; they count as one."""
@@ -184,6 +201,7 @@ def test_slopes_are_those_of_the_forward_map(ready, loads, most):
     assert error.max() < most  # elements away from the loads are left out
 
 
+@pytest.mark.slow
 def test_what_is_not_known_of_the_coat_moves_the_readings_of_a_load(ready):
     """Slopes in the coat against differences of frames with and without the load."""
     fitter, _, _, noise = ready
@@ -210,6 +228,7 @@ class Gain(NamedTuple):
         return self.mean(points), modes, self.deviation**2 * np.eye(modes.shape[1])
 
 
+@pytest.mark.slow
 def test_a_gain_of_which_nothing_is_known_changes_nothing(ready):
     """The errors of the readings by the modes of the gain, and the readings."""
     fitter, _, _, noise = ready
@@ -237,6 +256,7 @@ def test_a_gain_that_is_even_and_known_is_a_factor_of_the_force(ready):
         np.testing.assert_allclose(getattr(other, name), expected, atol=1e-6 * np.abs(expected).max(), err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_gain_that_is_known_places_loads_where_they_are(ready):
     """Frames of an uneven layer on another mesh, with the field that they were simulated by."""
     fitter, finder, _, noise = ready

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 import jaxeit as je
-from jaxeit.contacts import LoadKind, Loads, Proposal
+from jaxeit.contacts import LoadKind, Loads, LoadSettings, Proposal
 
 from ...presses.streams import finite_mean
 from ..calibration import Calibration
@@ -103,9 +103,13 @@ class SeenLoads:
 
 
 def fit_windows(
-    calibration: Calibration, seen: WindowedFrames, progress: Any = iter, proposal: Proposal | None = None
+    calibration: Calibration,
+    seen: WindowedFrames,
+    progress: Any = iter,
+    proposal: Proposal | None = None,
+    settings: LoadSettings | None = None,
 ) -> SeenLoads:
-    """Fit loads to each window, from what a finder sees or from a proposal."""
+    """Fit loads to each window, from what a finder sees or from a proposal; ``settings`` as for `prepare_loads`."""
     noise = seen.quiet.noise
     if noise is None or not seen.windows:
         why = "no frames without contact tell the noise" if noise is None else "nothing touches the skin for that long"
@@ -115,8 +119,9 @@ def fit_windows(
     model = je.discretise(je.Scene(calibration.skin), FIDELITY)
     sheet, _ = fit_untouched_sheet(model, seen.quiet.untouched, channels)
     of_means = np.where(channels, noise, 1.0) / np.sqrt(np.median([window.frames for window in seen.windows]))
-    fitter = je.contacts.prepare_loads(model, noise=of_means, sigma=sheet, channels=channels, gain=calibration.layer)
-    finder = je.prepare_contacts(model, noise=of_means, sigma=sheet, channels=channels)
+    known = {"noise": of_means, "sigma": sheet, "channels": channels}
+    fitter = je.contacts.prepare_loads(model, settings, gain=calibration.layer, **known)
+    finder = je.prepare_contacts(model, **known)
     found = [_found(fitter, finder, proposal, window, channels) for window in progress(seen.windows)]
     loads, distance = zip(*found, strict=True)
     outside = int(np.sum(np.array(distance) > 1))

@@ -3,7 +3,14 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from ..arguments import above_zero, add_proposal_argument, prepare_results, proposal_of, require_matplotlib_for
+from ..arguments import (
+    NO_PROPOSAL,
+    above_zero,
+    add_proposal_argument,
+    prepare_results,
+    proposal_of,
+    require_matplotlib_for,
+)
 from ..recipe_options import add_low_pass_argument, processing_of, refuse_low_pass
 from ..terminal import progress_bar
 
@@ -21,6 +28,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "also tell what touches the skin (one, two or an edge, with probabilities) in windows of this duration"
     parser.add_argument("--loads", type=above_zero, metavar="SECONDS", help=text)
     add_proposal_argument(parser, "with --loads: the network of jaxeit train, where fits begin")
+    text = (
+        "with --loads: only round tips touch the skin; two are told apart at smaller distances, and nothing is an edge"
+    )
+    parser.add_argument("--round-tips", action="store_true", help=text)
     text = "also follow contacts from frame to frame: number, place with covariance, force, smoothed over time"
     parser.add_argument("--track", action="store_true", help=text)
     text = (
@@ -35,10 +46,12 @@ def run(args: argparse.Namespace) -> int:
     from ...runtime import set_up
 
     set_up()
+    from jaxeit.contacts import LoadSettings
+
     from ...calibration import LogCalibration, apply, load_calibration
     from ...session import open_session
 
-    _check_report(args)
+    _check_options(args)
     prepare_results(args, "output", "report")
     calibration = load_calibration(args.calibration)
     if isinstance(calibration, LogCalibration):
@@ -53,6 +66,7 @@ def run(args: argparse.Namespace) -> int:
             progress=progress_bar("frames"),
             loads=args.loads,
             proposal=proposal_of(args.proposal),
+            load_settings=LoadSettings.round_tips() if args.round_tips else None,
             track=args.track,
             tell=print,
         )
@@ -65,9 +79,13 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _check_report(args: argparse.Namespace) -> None:
+def _check_options(args: argparse.Namespace) -> None:
     if args.proposal is not None and args.loads is None:
         raise ValueError("--proposal: it is where fits of loads begin; add --loads SECONDS")
+    if args.round_tips and args.loads is None:
+        raise ValueError("--round-tips: it is about fits of loads; add --loads SECONDS")
+    if args.round_tips and args.proposal not in (None, NO_PROPOSAL):
+        raise ValueError("--round-tips: a proposal was trained on tips of all shapes; leave out one of the two")
     if args.report is not None:
         if not args.track and args.loads is None:
             raise ValueError("--report: it is about contacts; add --track, which follows them, or --loads SECONDS")

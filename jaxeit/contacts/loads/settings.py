@@ -1,6 +1,7 @@
 """What is known of loads before a frame."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,7 @@ POSITIVE = (
     *("gain_length", "coat_length", "width", "width_spread", "force", "force_spread"),
     *("width_difference", "force_difference", "length", "nearest", "shortest"),
 )
+NO_EDGE = (0.25, 0.25, 0.25, 0.0, 0.25)
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,10 @@ class LoadSettings:
 
     Raises:
         InverseError: for a value out of range.
+
+    Example:
+        settings = je.contacts.LoadSettings(force=5.0)  # N, usual here
+        balls = je.contacts.LoadSettings.round_tips()  # nothing long, flat, hollow or tilted touches the skin
     """
 
     law: ContactPiezoresistance = field(default_factory=ContactPiezoresistance)
@@ -76,6 +82,16 @@ class LoadSettings:
             raise InverseError(f"shapes is {self.shapes}; give numbers of at least 0")
         if len(self.prior) != 5 or min(self.prior) < 0 or not np.isclose(sum(self.prior), 1):
             raise InverseError(f"prior is {self.prior}; give five probabilities whose sum is 1")
+
+    @classmethod
+    def round_tips(cls, **others: Any) -> "LoadSettings":
+        """Settings for a skin that only round tips touch, no wider than their spread in the skin; ``others`` as usual.
+
+        Nothing is an edge, and the shape of a load is nearly a Gaussian. So what a flat or a long tip would explain is
+        two loads, and two are told apart at smaller distances; a tip that is flat, hollow or tilted is told as several.
+        """
+        usual: dict[str, Any] = {"shape": 0.03, "shapes": (0.0, 1.0), "nearest": 8e-3, "prior": NO_EDGE}
+        return cls(**usual | others)
 
     def coat_spread(self, known: bool) -> float:
         """Standard deviation of the log conductivity that the sheet is not known by."""
