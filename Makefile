@@ -23,7 +23,7 @@ $(VENV)/.docs: pyproject.toml
 	touch $@
 
 demo: $(VENV)/.report
-	$(BIN)/jaxeit calibrate data/sessions/testbed_grid.h5 --location edge --test data/sessions/testbed_presses.h5 \
+	$(BIN)/jaxeit calibrate data/sessions/testbed_grid.h5 --location edge-spline --test data/sessions/testbed_presses.h5 \
 	    -o $(OUT)/calibration.h5 --report $(OUT)/report.html
 
 test: $(VENV)/.dev

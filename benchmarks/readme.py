@@ -20,7 +20,7 @@ PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 def main() -> None:
     set_up()
     with calib.open_session(ROOT / "data" / "sessions" / "testbed_grid.h5") as session:
-        calibration = calib.calibrate([session], recipe=calib.Recipe(location=calib.PadEdge()))
+        calibration = calib.calibrate([session], recipe=calib.Recipe(location=calib.PadEdgeSpline()))
     results, stored = table("results", calibration.evaluation.summary()), measured()
     for page in PAGES:
         text = filled(replaced(page.read_text(encoding="utf-8"), "results", results), stored)

@@ -53,6 +53,7 @@ from .fitting import (
     MonotonePolynomial as MonotonePolynomial,
     MonotoneSpline as MonotoneSpline,
     PadEdge as PadEdge,
+    PadEdgeSpline as PadEdgeSpline,
     PowerLaw as PowerLaw,
     fit_curves as fit_curves,
 )

@@ -62,7 +62,7 @@ class PadEdge(AbstractField):
 
 
 class PadEdgeSpline(PadEdge):
-    """`PadEdge` with smooth functions of any shape, also of two distances together, for presses from 60 places on.
+    """`PadEdge` with smooth functions of any shape, also of two distances together, and a stated error that grows between presses.
 
     Functions are sums of cubic B-splines with two knots an octave. By the prior, a function is a Gaussian process over
     octaves u of distance, which falls off with the distance: the covariance of coefficients at u and v is
@@ -72,7 +72,7 @@ class PadEdgeSpline(PadEdge):
     process.
 
     Example:
-        recipe = calib.Recipe(location=fitting.PadEdgeSpline())
+        recipe = calib.Recipe(location=calib.PadEdgeSpline())
     """
 
     name: ClassVar[str] = "edge-spline"
