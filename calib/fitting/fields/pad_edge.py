@@ -62,7 +62,7 @@ class PadEdge(AbstractField):
 
 
 class PadEdgeSpline(PadEdge):
-    """`PadEdge` with smooth functions of any shape, also of two distances together, and a stated error that grows between presses.
+    """`PadEdge` with smooth functions of any shape, also of two distances together.
 
     Functions are sums of cubic B-splines with two knots an octave. By the prior, a function is a Gaussian process over
     octaves u of distance, which falls off with the distance: the covariance of coefficients at u and v is

@@ -87,8 +87,8 @@ class LoadSettings:
     def round_tips(cls, **others: Any) -> "LoadSettings":
         """Settings for a skin that only round tips touch, no wider than their spread in the skin; ``others`` as usual.
 
-        Nothing is an edge, and the shape of a load is nearly a Gaussian. So what a tilted or a long tip would explain is
-        two loads, and two are told apart at smaller distances; a tip that is hollow or tilted may be told as several.
+        Nothing is an edge, and the shape of a load is nearly a Gaussian. So what a tilted or a long tip would explain
+        is two loads, and two are told apart at smaller distances; hollow and tilted tips may be told as several.
         """
         usual: dict[str, Any] = {"shape": 0.03, "shapes": (0.0, 1.0), "nearest": 8e-3, "prior": NO_EDGE}
         return cls(**usual | others)
