@@ -135,8 +135,11 @@ CACHE = {  # as the command line sets it, calib/runtime.py
 
 
 def fresh(code: str, cache: str = "") -> tuple[float, str]:
-    """Seconds of a fresh Python that runs the code, with a folder of compiled programs or none; and what it prints."""
-    ours = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64", *CACHE)
+    """Seconds of a fresh Python that runs the code, with a folder of compiled programs or none; and what it prints.
+
+    Python keeps the bytecode of modules, as it does unless told otherwise.
+    """
+    ours = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_X64", "PYTHONDONTWRITEBYTECODE", *CACHE)
     environment = {name: value for name, value in os.environ.items() if name not in ours}
     environment |= CACHE | {"JAX_COMPILATION_CACHE_DIR": cache} if cache else {}
     how: Any = {"cwd": Path(__file__).parents[1], "env": environment, "capture_output": True, "check": True}
