@@ -72,6 +72,8 @@ def apply(
     ignored = accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED)
     calibration, outside = _agreement(calibration, session, levels)
     attrs = _attributes(calibration, session) | {"ignored_errors": "\n".join(ignored), "outside": "\n".join(outside)}
+    if loads is not None and load_settings is not None:
+        attrs["load_settings"] = load_settings.changed()
     for line in outside:
         tell(f"note: {line}")
     blocks = FrameBlocks(session, processing, levels)

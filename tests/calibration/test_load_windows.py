@@ -99,7 +99,9 @@ def test_two_contacts_are_told_over_time(session, tmp_path, capsys):
     np.testing.assert_allclose(share, np.tile([15.0, 10.0], (len(share), 1)), rtol=0.25)
     assert np.isnan(arrays["loads/distance"]).all()
     assert main([*searching[:-2], "--round-tips"]) == 0
-    of_round = calib.session.read_archive(out, "skin-forcemap").arrays
+    of_round = calib.session.read_archive(out, "skin-forcemap")
+    assert "nearest = 0.008" in of_round.attrs["load_settings"]
+    of_round = of_round.arrays
     assert np.isnan(of_round["loads/distance"]).all()  # no network, which was trained on tips of all shapes
     assert (of_round["loads/probability"][both, 2] > 0.9).all()
     assert not of_round["loads/probability"][:, 3].any()

@@ -46,6 +46,14 @@ def test_what_touches_the_sheet_is_told(ready, number):
     np.testing.assert_allclose(np.sort(best.force), np.sort(forces), rtol=0.35)
 
 
+def test_settings_say_what_differs_from_the_usual_ones():
+    assert LoadSettings().changed() == ""
+    assert LoadSettings(force=5.0, law=je.effects.ContactPiezoresistance(half_pressure=1e4)).changed().count(" = ") == 2
+    assert LoadSettings.round_tips(force=5.0).changed() == (
+        "shape = 0.03, shapes = (0.0, 1.0), force = 5.0, nearest = 0.008, prior = (0.25, 0.25, 0.25, 0.0, 0.25)"
+    )
+
+
 def test_near_tips_are_told_apart_where_only_round_ones_touch(ready):
     """A flat or a long tip would explain them; one tip stays one."""
     fitter, finder, _, _ = ready

@@ -1,11 +1,11 @@
 """What is known of loads before a frame."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 
-from ...effects.material import ContactPiezoresistance
+from ...effects import EFFECTS, ContactPiezoresistance
 from ...imaging.noise import InverseError
 
 KNOWN_COAT, UNKNOWN_COAT = 0.0, 0.15
@@ -92,6 +92,15 @@ class LoadSettings:
         """
         usual: dict[str, Any] = {"shape": 0.03, "shapes": (0.0, 1.0), "nearest": 8e-3, "prior": NO_EDGE}
         return cls(**usual | others)
+
+    def changed(self) -> str:
+        """What differs from the usual settings, in words; empty for the usual ones."""
+        own, usual = self._stated(), LoadSettings()._stated()
+        return ", ".join(f"{name} = {text}" for name, text in own.items() if text != usual[name])
+
+    def _stated(self) -> dict[str, str]:
+        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        return {name: str(value) for name, value in values.items()} | {"law": EFFECTS.text(self.law)}
 
     def coat_spread(self, known: bool) -> float:
         """Standard deviation of the log conductivity that the sheet is not known by."""
