@@ -182,6 +182,12 @@ def _drawn(
     return np.concatenate([place[None], others]), forces
 
 
+def corners(model: je.Model) -> tuple[np.ndarray, np.ndarray]:
+    """Of the flat sheet, m: the lowest and the highest coordinates."""
+    chart = np.asarray(model.chart, float)
+    return chart.min(0), chart.max(0)
+
+
 def simulated(seed: int, given: list[Touch], **how: Any) -> Pressed:
     """The frames of touches on the skin of a seed."""
     return pressed(uneven(seed), np.stack([t.places for t in given]), np.stack([t.loads for t in given]), **how)
@@ -302,7 +308,7 @@ def kinds(run: Run, skin: str = "testbed", seeds: int = 3) -> tuple[list[Row], l
     """Rows of all touches of a skin, and the reliability of their probabilities."""
     seeds, singles, others = run.sizes((seeds, 10, 3), (1, 1, 1))
     model = fit_model(skin)
-    low, high = (np.asarray(model.chart, float).min(0), np.asarray(model.chart, float).max(0))
+    low, high = corners(model)
     every, stated, true = [], [], []
     for seed in range(FIRST_SEED, FIRST_SEED + seeds):
         given = list(touches(np.random.default_rng(seed), singles, others, low, high))
@@ -327,7 +333,7 @@ def measure_chest(run: Run) -> Iterator[Row]:
 def measure_drawn(run: Run) -> Iterator[Row]:
     seeds, count = run.sizes((6, 40), (1, 2))
     model, known = fit_model(), je.contacts.LoadSettings()
-    low, high = (np.asarray(model.chart, float).min(0), np.asarray(model.chart, float).max(0))
+    low, high = corners(model)
     stated, true = [], []
     for seed in range(FIRST_SEED + 90, FIRST_SEED + 90 + seeds):
         rng = np.random.default_rng(seed)
@@ -356,7 +362,7 @@ def told_kinds(stated: list[np.ndarray], true: list[np.ndarray]) -> Iterator[Row
 def measure_round(run: Run) -> Iterator[Row]:
     seeds, singles, others, distances = run.sizes((6, 8, 3, NEAR), (1, 1, 1, NEAR[:1]))
     model, every = fit_model(), []
-    low, high = (np.asarray(model.chart, float).min(0), np.asarray(model.chart, float).max(0))
+    low, high = corners(model)
     for seed in range(FIRST_SEED + 110, FIRST_SEED + 110 + seeds):
         rng = np.random.default_rng(seed)
         parts = [(list(round_touches(rng, singles, others, distances, low, high)), 0.012)]

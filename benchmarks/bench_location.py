@@ -19,7 +19,7 @@ import numpy as np
 import calib
 from calib.bench import Bench, load_bench, simulate
 from calib.calibration.evaluation import THIRDS, Evaluation
-from calib.fitting.fields import PadEdgeSpline
+from calib.fitting.validation import rmse
 from jaxeit import effects as fx
 
 from .harness import ROOT, Question, Run
@@ -30,7 +30,7 @@ FIRST_SEED, SKINS, TESTS = 40, 6, 120
 LEVELS = (5.0, 10.0, 20.0)  # N
 LOW, HIGH = 0.01, 0.19  # m, of places along each side
 GRIDS, SCATTERED = (8, 12), (36, 64, 144)
-CORRECTIONS = {"none": None, "edge": calib.PadEdge(), "edge-spline": PadEdgeSpline()}
+CORRECTIONS = {"none": None, "edge": calib.PadEdge(), "edge-spline": calib.PadEdgeSpline()}
 
 
 def skin_of(bench: Bench, rng: np.random.Generator, seed: int) -> Bench:
@@ -86,30 +86,22 @@ def predicted(path: Path, test: Path, recipe: calib.Recipe) -> Evaluation:
 def judged(key: tuple[str, str], same: list[Row]) -> Row:
     """Errors and coverage of all presses that were predicted from a layout with a correction."""
     seen = [one["seen"] for one in same]
-    errors, widths = ([getter(one) for one in seen] for getter in (_errors, _widths))
-    each, (error, width) = [one.summary() for one in seen], map(np.concatenate, (errors, widths))
+    each = [one.summary() for one in seen]
+    told, true = (np.concatenate([getattr(one, name) for one in seen]) for name in ("total_force", "force"))
+    width = np.concatenate([one.half_width for one in seen])
     thirds = {name: [one[f"coverage_{name}"] for one in each] for name in THIRDS}
     return {
         "layout": key[0],
         "location": key[1],
         "skins": len(seen),
-        "presses": len(error),
-        "rmse_n": float(np.sqrt(np.mean(error**2))),
-        "worst_skin_n": max(float(np.sqrt(np.mean(one**2))) for one in errors),
-        "covered": float(np.mean(np.abs(error) <= width)),
+        "presses": len(true),
+        "rmse_n": rmse(told, true),
+        "worst_skin_n": max(one["force_rmse"] for one in each),
+        "covered": float(np.mean(np.abs(told - true) <= width)),
         "covered_least": min(one["coverage"] for one in each),
         **{f"covered_{name}": float(np.mean(values)) for name, values in thirds.items()},
         "half_width_n": float(width.mean()),
     }
-
-
-def _errors(seen: Evaluation) -> np.ndarray:
-    return np.asarray(seen.total_force - seen.force)
-
-
-def _widths(seen: Evaluation) -> np.ndarray:
-    assert seen.half_width is not None
-    return seen.half_width
 
 
 main = Question("location", __doc__, {"rows": measure})

@@ -49,7 +49,7 @@ class LoadSettings:
 
     Example:
         settings = je.contacts.LoadSettings(force=5.0)  # N, usual here
-        balls = je.contacts.LoadSettings.round_tips()  # nothing long, flat, hollow or tilted touches the skin
+        balls = je.contacts.LoadSettings.round_tips()  # nothing long, hollow or tilted touches the skin
     """
 
     law: ContactPiezoresistance = field(default_factory=ContactPiezoresistance)
