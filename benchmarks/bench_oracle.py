@@ -164,7 +164,7 @@ OTHER_TIPS = Bench(places=50, levels=(10.0,))
 
 def tracks(run: Run) -> Iterator[Row]:
     """Places of followed contacts, second ones that were none, and coverage, for each preparation of the tracker."""
-    bench, seeds = (SMOKE, (31,)) if run.smoke else (replace(FULL, levels=(8.0, 16.0), places=60), (31, 32))
+    bench, seeds = (SMOKE, (31,)) if run.smoke else (replace(FULL, levels=(8.0, 16.0), places=60), (33, 34))
     rows = []
     for seed in seeds:
         for name, faults in run.sizes(list(FOLLOWED.items()), [("as simulated", Faults())]):

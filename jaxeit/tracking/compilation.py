@@ -34,5 +34,5 @@ def compile_tracker(tracker: Tracker) -> None:
         tracker.step(now, frame, SECONDS, np.zeros(pads), np.ones(pads))
         tracker.programs.predicted(belief, SECONDS)
         if count:
-            tracker.programs.consider_covariance(belief, Pads(jnp.zeros(pads), jnp.ones(pads)))
+            tracker.programs.consider_covariance(belief, Pads(jnp.zeros(pads), jnp.ones(pads)), 0.0)
         belief = tracker.events.with_contact(belief, places[count * len(places) // (most + 1)])

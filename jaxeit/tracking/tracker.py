@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
+from scipy.spatial import KDTree
 
 from .._compile import require_known
 from ..imaging.absolute.background import UntouchedSheet, fitted_sheet, untouched_frame
@@ -45,6 +46,8 @@ UNEXPECTED, SURPRISING = 4.0, 25.0
 MOST_GAIN = 4.0
 # A frame that no event explains is asked about again after `Tracking.patience`, or where it is so much worse.
 WORSE = 1.3
+# Widths of a load beyond which no pad feels it.
+REACH = 3.0
 # Part of the signal of contacts that a frame may be off, for contacts that moved on while frames waited for too long.
 UNSEEN = 0.01
 
@@ -94,7 +97,7 @@ class Tracker:
     def _untouched(self, layer: LearnedLayer) -> Belief:
         """The belief without contacts; its gain is that under the next press."""
         put = partial(jnp.asarray, dtype=self.filter.places.dtype)
-        return Belief(put(np.zeros((0, SIZE))), put(layer.mean), put(layer.under_press))
+        return Belief(put(np.zeros((0, SIZE))), put(layer.mean), put(layer.before_press))
 
     def learned(self, now: Tracking) -> LearnedLayer:
         """What contacts have told of the gain of the contact layer up to now, to `start` with another time."""
@@ -242,7 +245,7 @@ class Tracker:
         contacts = np.asarray(now.belief.contacts)
         if not now.numbers or now.considered.holds(now.numbers, contacts):
             return now
-        covariance = self.programs.consider_covariance(now.belief, pads)
+        covariance = self.programs.consider_covariance(now.belief, pads, now.layer.unexplained)
         return replace(now, considered=ConsiderErrors(now.numbers, contacts[:, :SEEN], covariance))
 
     def _looked(self, now: Tracking, backlog: Backlog) -> Tracking:
@@ -279,7 +282,11 @@ class Tracker:
         return frame
 
     def pads(self, forces: Float[ArrayLike, " pads"] | None, errors: Float[ArrayLike, " pads"] | None) -> Pads:
-        """Forces on pads as the programs take them; raises InverseError if an array has another shape."""
+        """Forces on pads as the programs take them; raises InverseError if an array has another shape.
+
+        How much of a load lies on the pads beside depends on its shape, which is not known: where a pad bears no load,
+        it may still feel the tail of a contact on another. So their errors hold a share of the load beside them.
+        """
         count = self.filter.sheet.pad_area.shape[1]
         if forces is None:
             return Pads(jnp.zeros(count), jnp.full(count, jnp.inf, float))  # as those that are known: no weak type
@@ -291,7 +298,18 @@ class Tracker:
         known = np.isfinite(force) & np.isfinite(error)
         if not (error[known] > 0).all():
             raise InverseError("a pad has the standard error zero; give a number above zero, in newtons")
-        return Pads(jnp.asarray(np.where(known, force, 0)), jnp.asarray(np.where(known, error, np.inf)))
+        force = np.where(known, force, 0)
+        tails = self.settings.tail * (self._beside @ np.maximum(force, 0))
+        return Pads(jnp.asarray(force), jnp.asarray(np.where(known, np.hypot(error, tails), np.inf)))
+
+    @cached_property
+    def _beside(self) -> Bool[np.ndarray, "pads pads"]:
+        """Which pads a load on a pad may reach: those within `REACH` usual widths of it."""
+        on, pixels = np.asarray(self.filter.sheet.pad_area) > 0, np.asarray(self.filter.sheet.pixels)
+        trees = [KDTree(pixels[own]) for own in on.T]
+        reach = REACH * self.settings.loads.width
+        near = np.array([[one.count_neighbors(other, reach) > 0 for other in trees] for one in trees])
+        return near & ~np.eye(len(trees), dtype=bool)
 
     def _is_unexpected(self, now: Tracking, update: Update) -> bool:
         if float(update.surprise) >= SURPRISING:
@@ -311,7 +329,7 @@ def bounded(now: Tracking) -> Tracking:
     covariance = np.array(now.belief.covariance)
     own = now.belief.contacts.size
     covariance[own:] = covariance[:, own:] = 0
-    covariance[own:, own:] = layer.under_press
+    covariance[own:, own:] = layer.before_press
     return replace(now, belief=Belief(now.belief.contacts, jnp.asarray(layer.mean), jnp.asarray(covariance)))
 
 

@@ -11,9 +11,9 @@ from scipy.linalg import eigh
 import jaxeit as je
 from jaxeit.contacts.loads.settings import LoadSettings
 from jaxeit.imaging import InverseError
-from jaxeit.tracking import GainField, LearnedLayer, prepare_tracker
+from jaxeit.tracking import GainField, LearnedLayer, Tracker, prepare_tracker
 from jaxeit.tracking.belief.apparent_gain import apparent_gain
-from jaxeit.tracking.belief.layer import OUTLIER, PRESS_VARIANCES
+from jaxeit.tracking.belief.layer import MOST_EXPLAINED, OUTLIER, PRESS_VARIANCES
 from jaxeit.tracking.belief.programs import APART
 from jaxeit.tracking.belief.response import Near, load_pressure
 from jaxeit.tracking.preparation import with_errors
@@ -36,7 +36,7 @@ def test_a_gain_beyond_all_belief_is_forgotten_and_the_contacts_stay(tracker, fr
     found = bounded(wrong).belief
     np.testing.assert_array_equal(found.contacts, now.belief.contacts)
     np.testing.assert_array_equal(found.covariance[:8, :8], now.belief.covariance[:8, :8])
-    np.testing.assert_array_equal(found.covariance[8:, 8:], now.layer.under_press)
+    np.testing.assert_array_equal(found.covariance[8:, 8:], now.layer.before_press)
     assert not found.gain.any()
     assert not found.covariance[:8, 8:].any()
 
@@ -172,6 +172,27 @@ def test_a_press_states_the_error_of_the_gain_under_it(model, skin, blank):
     assert 0.8 < np.mean(pulls**2) < 1.5
 
 
+def test_the_effect_of_a_press_does_not_move_contacts_and_is_in_the_error_of_forces(tracker, frame_of):
+    """Presses that differ by a variance of ten: readings hardly tell a force, pads do, and places stay as they are."""
+    layers = [
+        LearnedLayer.unknown(tracker.field)._replace(evidence=np.where(variance == PRESS_VARIANCES, 0.0, -1e3))
+        for variance in (MOST_EXPLAINED, 10.0)
+    ]
+    frames = [frame_of([load(0.05, 0.06, max(force, 1e-6))]) for force in (0.0, 10.0, 10.0)]
+    states = [tracker.start(layer) for layer in layers]
+    for frame in frames:
+        states = [tracker.step(now, frame, SECONDS) for now in states]
+    ((few,), (many,)) = (now.tracks for now in states)
+    np.testing.assert_allclose(many.position, few.position, rtol=1e-9)
+    np.testing.assert_allclose(many.covariance, few.covariance, rtol=1e-9)
+    added = np.sqrt((many.log_force_error**2 - few.log_force_error**2) / (10.0 - MOST_EXPLAINED))
+    assert 0.8 < added / np.hypot(tracker.field.level, tracker.field.deviation) < 1.1
+    now = tracker.start(layers[1])
+    for frame, force in zip(frames, (0.0, 1.0, 1.0), strict=True):
+        now = tracker.step(now, frame, SECONDS, FORCES * force + 1e-9, np.full(4, 0.2))
+    assert now.tracks[0].log_force_error < 0.05
+
+
 @pytest.mark.slow
 def test_the_gain_for_fits_of_loads_is_that_of_the_next_press(layer):
     """Its covariance is that of the layer and an effect of the press."""
@@ -256,7 +277,7 @@ def after_presses(rng, counts, variance):
     for number in range(max(counts)):
         under, rows = true + np.sqrt(variance) * rng.normal(size=8), rng.normal(size=(3, 8))
         seen = rows @ under + NOISE * rng.normal(size=3)
-        before = layer.under_press
+        before = layer.before_press
         gain = before @ rows.T @ np.linalg.inv(rows @ before @ rows.T + NOISE**2 * np.eye(3))
         layer = layer.told(layer.mean + gain @ (seen - rows @ layer.mean), before - gain @ rows @ before, 1)
         if number + 1 in counts:
@@ -279,7 +300,7 @@ def test_without_an_effect_of_the_press_the_layer_is_the_belief_of_the_press():
 
 def test_a_press_that_tells_nothing_changes_nothing():
     layer = LearnedLayer.unknown(SMALL)
-    again = layer.told(layer.mean, layer.under_press, 1)
+    again = layer.told(layer.mean, layer.before_press, 1)
     np.testing.assert_array_equal(again.covariances, layer.covariances)
     np.testing.assert_allclose(again.probabilities, layer.probabilities)
 
@@ -331,6 +352,8 @@ def test_errors_of_sheet_and_mesh_do_not_matter_where_nothing_was_told():
 def test_a_sheet_that_is_wrong_looks_like_gain(model, tracker):
     """The true gain is one everywhere. On one side of the sheet the conductivity is 2 % higher than the tracker's sheet
     has it, and as much lower on the other. Presses of known force then teach the gain that is foreseen."""
+    settings = replace(tracker.settings, tail=0.0)  # the shape of loads is that of the tracker
+    tracker = Tracker(tracker.filter, tracker.of_presses, settings, tracker.area, tracker.field)
     error, sheet = 0.02 * np.sin(np.pi * (np.asarray(model.centroids)[:, 0] - 0.1) / 0.2), tracker.filter.sheet
     loads, true = tracker.settings.loads, model.background * jnp.exp(error)
 
@@ -355,14 +378,14 @@ def test_a_sheet_that_is_wrong_looks_like_gain(model, tracker):
 
 def test_no_single_press_rules_a_variance_out():
     ((layer, _),) = after_presses(np.random.default_rng(704), (10,), 0.0)
-    wild = layer.told(layer.mean + 100, 0.5 * layer.under_press, 1)
+    wild = layer.told(layer.mean + 100, 0.5 * layer.before_press, 1)
     assert (wild.evidence - layer.evidence).min() >= np.log(OUTLIER) - 1e-9
     assert np.ptp(wild.evidence - layer.evidence) > 1
 
 
 @pytest.mark.slow
 def test_after_a_press_the_next_one_has_an_effect_of_its_own(tracker, frame_of):
-    """What is known of the gain under the next press is the layer and the effect; and no press, no lesson."""
+    """The gain with which the next press begins is the layer and the effect; and no press, no lesson."""
     start = LearnedLayer.unknown(tracker.field)._replace(evidence=np.linspace(-30, 0, len(PRESS_VARIANCES)))
     now = tracker.start(start)
     for force in (0.0, 10.0, 10.0, 10.0, 0.0, 0.0):
@@ -372,7 +395,7 @@ def test_after_a_press_the_next_one_has_an_effect_of_its_own(tracker, frame_of):
     known = tracker.learned(now)
     assert not now.numbers
     assert now.taught == now.begun == known.contacts == 1
-    np.testing.assert_allclose(now.belief.covariance, known.under_press)
+    np.testing.assert_allclose(now.belief.covariance, known.before_press)
     assert np.trace(known.covariance) < np.trace(start.covariance)
     again = tracker.start(start)
     assert tracker.learned(again) is again.layer

@@ -136,7 +136,7 @@ def test_contacts_begin_anew_after_an_update_that_is_not_finite(tracker, frame_o
     assert lost.numbers == ()
     known = tracker.learned(now)
     np.testing.assert_array_equal(lost.belief.gain, known.mean)
-    np.testing.assert_array_equal(lost.belief.covariance, known.under_press)
+    np.testing.assert_array_equal(lost.belief.covariance, known.before_press)
     found = tracker.step(lost, frame_of(truth(31)), SECONDS)
     assert found.numbers
     assert min(found.numbers) == 3  # a number is never given twice

@@ -1,11 +1,13 @@
 """Contacts followed through simulated frames, and the filter against a joint normal distribution."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxeit.imaging import InverseError
-from jaxeit.tracking import TrackerSettings
+from jaxeit.tracking import Tracker, TrackerSettings
 from jaxeit.tracking.belief.filter import SEEN, SIZE, Pads, active_numbers, predicted, updated
 
 from .conftest import SECONDS, in_double_precision, load
@@ -88,6 +90,27 @@ def test_pads_tell_the_force(tracker, frame_of):
     assert track.log_force_error < 0.03
 
 
+def test_a_tail_on_the_pad_beside_is_no_contact(tracker, frame_of):
+    """A load of another shape lies on the pad beside by 8 % more than the contact believes, 16 mm from its border."""
+    now = tracker.start()
+    for force in (0.0, *4 * [10.0]):
+        frame = frame_of([load(0.084, 0.05, max(force, 1e-6), 0.008)])
+        now = tracker.step(now, frame, SECONDS, force * np.array([0.9, 0.1, 0.0, 0.0]) + 1e-9, np.full(4, 0.1))
+    (track,) = now.tracks
+    assert np.linalg.norm(track.position - [0.084, 0.05]) < 0.5e-3  # 1 mm if the pad were believed
+    assert track.force == pytest.approx(10, rel=0.12)
+
+
+def test_errors_of_pads_hold_the_tails_of_loads_beside_them(tracker):
+    force, error = np.array([10.0, -1.0, np.nan, 2.0]), np.array([0.3, 0.4, 0.1, 0.5])
+    share = tracker.settings.tail
+    expected = [np.hypot(0.3, 2 * share), np.hypot(0.4, 12 * share), np.inf, np.hypot(0.5, 10 * share)]
+    np.testing.assert_allclose(tracker.pads(force, error).error, expected)
+    narrow = replace(tracker.settings, loads=replace(tracker.settings.loads, width=1e-4))  # its tails reach no pad
+    apart = Tracker(tracker.filter, tracker.of_presses, narrow, tracker.area, tracker.field)
+    np.testing.assert_allclose(apart.pads(force, error).error, [0.3, 0.4, np.inf, 0.5])
+
+
 def test_missing_readings_are_left_out(tracker, frame_of, followed):
     """A frame that lacks a tenth of its readings moves a contact by no more than its error."""
     before = followed[0][7]
@@ -146,7 +169,9 @@ def test_wrong_frames_are_refused(tracker, given, said):
         tracker.step(tracker.start(), **arguments)
 
 
-@pytest.mark.parametrize("wrong", [{"level": 0.0}, {"most": 0}, {"persistence": np.inf}, {"birth_rate": -1.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"level": 0.0}, {"tail": -0.1}, {"most": 0}, {"persistence": np.inf}, {"birth_rate": -1.0}]
+)
 def test_wrong_settings_are_refused(wrong):
     with pytest.raises(InverseError, match=next(iter(wrong))):
         TrackerSettings(**wrong)

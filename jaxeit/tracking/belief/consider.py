@@ -33,12 +33,16 @@ CHANGED = np.array([0.002, 0.002, 0.1, 0.2, 0.002, 0.002])
 
 
 @verb
-def consider_covariance(tracker: ContactFilter, belief: Belief, pads: Pads) -> Float[Array, "K 6 6"]:
+def consider_covariance(
+    tracker: ContactFilter, belief: Belief, pads: Pads, unexplained: Float[Array, ""]
+) -> Float[Array, "K 6 6"]:
     """Covariance of the first six numbers of each contact that unknown shapes, coat and errors of the model cause.
 
     Args:
         belief: of one contact or more.
         pads: whose errors say how closely they tell forces.
+        unexplained: variance of the effect of a press on the gain that the belief leaves out
+            (`LearnedLayer.unexplained`); forces err by it, and places hardly.
     """
     contacts, count = belief.contacts[:, :SEEN], len(belief.contacts)
     active = active_numbers(tracker, belief.contacts)
@@ -68,7 +72,10 @@ def consider_covariance(tracker: ContactFilter, belief: Belief, pads: Pads) -> F
     towards = jnp.concatenate([whitened @ bent.T, by_model], 1)
     moved = before[:, None] * lapack.cho_solve((root, True), towards)
     own = moved[: contacts.size].reshape(count, SEEN, -1)
-    return jnp.einsum("kim,kjm->kij", own, own)
+    found = jnp.einsum("kim,kjm->kij", own, own)
+    by_press = before[:, None] * lapack.cho_solve((root, True), whitened @ of_modes.T)
+    on_forces = jnp.sum(by_press[3 : contacts.size : SEEN] ** 2, 1)
+    return found.at[:, 3, 3].add(unexplained * on_forces)
 
 
 class ConsiderErrors(NamedTuple):

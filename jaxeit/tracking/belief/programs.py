@@ -75,9 +75,9 @@ class Programs:
         """See `filter.concluded`."""
         return self._concluded(_free(belief), dv, pads, attempt)
 
-    def consider_covariance(self, belief: Belief, pads: Pads) -> Float[np.ndarray, "K 6 6"]:
+    def consider_covariance(self, belief: Belief, pads: Pads, unexplained: float) -> Float[np.ndarray, "K 6 6"]:
         """See `consider.consider_covariance`."""
-        return np.asarray(self._consider_covariance(_free(belief), pads))
+        return np.asarray(self._consider_covariance(_free(belief), pads, np.asarray(unexplained, self._dtype)))
 
     def unexplained_place(
         self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads
