@@ -23,6 +23,9 @@ from .quiet_frames import ENOUGH, QuietFrames
 MIN_SECONDS = 1e-4  # between frames; those that arrive together bear about the same time
 # Part of a pad's force by which curve and shape of the load may err; its standard error is that of the pressure alone.
 PAD_SHARE = 0.05
+# Standard deviation of the gain that all readings share, as current source and amplifiers warm. Without it a drift of a
+# ten-thousandth, which is as loud as the noise, is explained by weak and wide contacts.
+GAIN_DRIFT = 1e-3
 
 Rows = dict[str, np.ndarray]
 
@@ -38,7 +41,8 @@ def prepare_calibrated_tracker(
 
     Args:
         untouched: mean frame without contact, V.
-        noise: standard deviation of the readings of a frame, V; readings without noise are left out.
+        noise: standard deviation of the readings of a frame, V; readings without noise are left out. The frame as a
+            whole may also drift by `GAIN_DRIFT`.
 
     Raises:
         NotFollowed: if the noise is not known, or the presses of the calibration do not tell the model error.
@@ -49,7 +53,8 @@ def prepare_calibrated_tracker(
     if not channels.any():
         raise NotFollowed("no reading has noise without contact, so none tells how sure it is")
     model = je.discretise(je.Scene(calibration.skin), FIDELITY)
-    noise = np.where(channels, noise, 1.0)
+    drift = GAIN_DRIFT * np.where(channels, untouched, 0.0)
+    noise = np.diag(np.where(channels, noise, 1.0) ** 2) + np.outer(drift, drift)
     prepare = partial(je.tracking.prepare_tracker, model, calibration.skin, noise=noise, channels=channels)
     try:
         tracker = prepare(untouched=untouched)
