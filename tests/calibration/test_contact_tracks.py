@@ -14,6 +14,7 @@ from calib.calibration.calibration import Calibration
 from calib.calibration.localisation import contact_tracks
 from calib.calibration.localisation.contact_tracks import (
     ABOUT,
+    GAIN_DRIFT,
     MIN_SECONDS,
     PAD_SHARE,
     ContactTracks,
@@ -87,6 +88,17 @@ def test_a_sheet_that_no_coat_explains_is_taken_for_even(skin, monkeypatch):
     np.testing.assert_array_equal(asked[0], untouched)
     np.testing.assert_array_equal(asked[1], -untouched)
     assert asked[2:] == [None]
+
+
+def test_a_drift_of_all_readings_is_noise():
+    """A drift of a thousandth of all readings is as probable as noise; one of a single reading is not."""
+    rng = np.random.default_rng(0)
+    untouched, noise = rng.uniform(0.1, 1.0, 300), np.full(300, 1e-6)
+    covariance = contact_tracks._covariance(noise, untouched)
+    alone = np.where(np.arange(300) == 7, GAIN_DRIFT * untouched, 0.0)
+    together, single = (x @ np.linalg.solve(covariance, x) for x in (GAIN_DRIFT * untouched, alone))
+    assert together == pytest.approx(1, rel=1e-3)
+    assert single > 1e3
 
 
 def test_rows_are_the_contacts_of_each_frame():

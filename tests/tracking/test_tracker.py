@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from jaxeit.imaging import InverseError
-from jaxeit.tracking import Tracker, TrackerSettings
+from jaxeit.tracking import Tracker, TrackerSettings, prepare_tracker
 from jaxeit.tracking.belief.filter import SEEN, SIZE, Pads, active_numbers, predicted, updated
 
-from .conftest import SECONDS, in_double_precision, load
+from .conftest import SECONDS, SETTINGS, in_double_precision, load
 
 
 def silent(tracker):
@@ -99,6 +99,20 @@ def test_a_tail_on_the_pad_beside_is_no_contact(tracker, frame_of):
     (track,) = now.tracks
     assert np.linalg.norm(track.position - [0.084, 0.05]) < 0.5e-3  # 1 mm if the pad were believed
     assert track.force == pytest.approx(10, rel=0.12)
+
+
+@pytest.mark.slow
+def test_a_drift_that_is_noise_begins_no_contact(model, skin, blank, tracker):
+    """The noise of the readings may be a covariance: of a gain that all share, as amplifiers warm."""
+    v0, noise = blank
+    rng, drift = np.random.default_rng(3), 0.02 * v0  # some twenty times the noise
+    covariance = np.diag(noise**2) + np.outer(drift, drift)
+    patient = prepare_tracker(model, skin, SETTINGS, noise=covariance, sigma=model.background)
+    for one, contacts in ((tracker, True), (patient, False)):
+        now = one.start()
+        for share in np.linspace(0, 1, 10):
+            now = one.step(now, share * drift + noise * rng.normal(size=noise.size), SECONDS)
+        assert (now.begun > 0) is contacts
 
 
 def test_errors_of_pads_hold_the_tails_of_loads_beside_them(tracker):

@@ -53,14 +53,19 @@ def prepare_calibrated_tracker(
     if not channels.any():
         raise NotFollowed("no reading has noise without contact, so none tells how sure it is")
     model = je.discretise(je.Scene(calibration.skin), FIDELITY)
-    drift = GAIN_DRIFT * np.where(channels, untouched, 0.0)
-    noise = np.diag(np.where(channels, noise, 1.0) ** 2) + np.outer(drift, drift)
-    prepare = partial(je.tracking.prepare_tracker, model, calibration.skin, noise=noise, channels=channels)
+    errors = _covariance(np.where(channels, noise, 1.0), np.where(channels, untouched, 0.0))
+    prepare = partial(je.tracking.prepare_tracker, model, calibration.skin, noise=errors, channels=channels)
     try:
         tracker = prepare(untouched=untouched)
     except je.imaging.InverseError:  # no sheet fits the untouched frame, which is taken for even
         tracker = prepare()
     return _with_model_error(tracker, calibration)
+
+
+def _covariance(noise: Float[np.ndarray, " n"], untouched: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+    """Covariance of the readings of a frame, V^2: the noise of each, and a gain that all share."""
+    drift = GAIN_DRIFT * untouched
+    return np.diag(noise**2) + np.outer(drift, drift)
 
 
 def _with_model_error(tracker: Tracker, calibration: Calibration) -> Tracker:
