@@ -23,7 +23,7 @@ class TrackerSettings:
     |--------------------------------------------------------------------------------|---------|-----------|
     | loads: law of pressure, gain of the contact layer, usual sizes, forces, and shapes, here of 0.15 |  |      |
     | level: standard deviation of the log of the gain that all places share         | 0.3     | 1         |
-    | tail: share of the load on pads beside it by which the force on a pad may err  | 0.1     | 1         |
+    | tail: share of the load on pads beside it by which the force on a pad may err  | 0       | 1         |
     | persistence: time over which errors of mesh and load shape stay as they are    | 0.5     | s         |
     | acceleration: change of a contact's velocity                                   | 0.3     | m/s/sqrt(s) |
     | width_rate, force_rate: change of the logs of width and force                  | 0.5, 5  | 1/sqrt(s) |
@@ -42,7 +42,7 @@ class TrackerSettings:
 
     loads: LoadSettings = field(default_factory=partial(LoadSettings, shape=SHAPE))
     level: float = 0.3
-    tail: float = 0.1
+    tail: float = 0.0
     persistence: float = 0.5
     acceleration: float = 0.3
     width_rate: float = 0.5

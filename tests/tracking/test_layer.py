@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 import jaxeit as je
 from jaxeit.contacts.loads.settings import LoadSettings
 from jaxeit.imaging import InverseError
-from jaxeit.tracking import GainField, LearnedLayer, Tracker, prepare_tracker
+from jaxeit.tracking import GainField, LearnedLayer, prepare_tracker
 from jaxeit.tracking.belief.apparent_gain import apparent_gain
 from jaxeit.tracking.belief.layer import MOST_EXPLAINED, OUTLIER, PRESS_VARIANCES
 from jaxeit.tracking.belief.programs import APART
@@ -352,8 +352,6 @@ def test_errors_of_sheet_and_mesh_do_not_matter_where_nothing_was_told():
 def test_a_sheet_that_is_wrong_looks_like_gain(model, tracker):
     """The true gain is one everywhere. On one side of the sheet the conductivity is 2 % higher than the tracker's sheet
     has it, and as much lower on the other. Presses of known force then teach the gain that is foreseen."""
-    settings = replace(tracker.settings, tail=0.0)  # the shape of loads is that of the tracker
-    tracker = Tracker(tracker.filter, tracker.of_presses, settings, tracker.area, tracker.field)
     error, sheet = 0.02 * np.sin(np.pi * (np.asarray(model.centroids)[:, 0] - 0.1) / 0.2), tracker.filter.sheet
     loads, true = tracker.settings.loads, model.background * jnp.exp(error)
 

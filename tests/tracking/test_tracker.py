@@ -90,15 +90,24 @@ def test_pads_tell_the_force(tracker, frame_of):
     assert track.log_force_error < 0.03
 
 
-def test_a_tail_on_the_pad_beside_is_no_contact(tracker, frame_of):
+def with_settings(tracker, **settings):
+    """The tracker with other settings, of those that its filter does not hold."""
+    given = replace(tracker.settings, **settings)
+    return Tracker(tracker.filter, tracker.of_presses, given, tracker.area, tracker.field)
+
+
+def test_a_tail_on_the_pad_beside_moves_no_contact(tracker, frame_of):
     """A load of another shape lies on the pad beside by 8 % more than the contact believes, 16 mm from its border."""
-    now = tracker.start()
-    for force in (0.0, *4 * [10.0]):
-        frame = frame_of([load(0.084, 0.05, max(force, 1e-6), 0.008)])
-        now = tracker.step(now, frame, SECONDS, force * np.array([0.9, 0.1, 0.0, 0.0]) + 1e-9, np.full(4, 0.1))
-    (track,) = now.tracks
-    assert np.linalg.norm(track.position - [0.084, 0.05]) < 0.5e-3  # 1 mm if the pad were believed
-    assert track.force == pytest.approx(10, rel=0.12)
+    frames = [frame_of([load(0.084, 0.05, max(force, 1e-6), 0.008)]) for force in (0.0, *4 * [10.0])]
+    away = []
+    for one in (tracker, with_settings(tracker, tail=0.1)):
+        now = one.start()
+        for frame, force in zip(frames, (0.0, *4 * [10.0]), strict=True):
+            now = one.step(now, frame, SECONDS, force * np.array([0.9, 0.1, 0.0, 0.0]) + 1e-9, np.full(4, 0.1))
+        (track,) = now.tracks
+        away.append(np.linalg.norm(track.position - [0.084, 0.05]))
+        assert track.force == pytest.approx(10, rel=0.12)
+    assert away[1] < 0.5e-3 < away[0]
 
 
 @pytest.mark.slow
@@ -116,13 +125,13 @@ def test_a_drift_that_is_noise_begins_no_contact(model, skin, blank, tracker):
 
 
 def test_errors_of_pads_hold_the_tails_of_loads_beside_them(tracker):
-    force, error = np.array([10.0, -1.0, np.nan, 2.0]), np.array([0.3, 0.4, 0.1, 0.5])
-    share = tracker.settings.tail
+    force, error, share = np.array([10.0, -1.0, np.nan, 2.0]), np.array([0.3, 0.4, 0.1, 0.5]), 0.2
     expected = [np.hypot(0.3, 2 * share), np.hypot(0.4, 12 * share), np.inf, np.hypot(0.5, 10 * share)]
-    np.testing.assert_allclose(tracker.pads(force, error).error, expected)
-    narrow = replace(tracker.settings, loads=replace(tracker.settings.loads, width=1e-4))  # its tails reach no pad
-    apart = Tracker(tracker.filter, tracker.of_presses, narrow, tracker.area, tracker.field)
-    np.testing.assert_allclose(apart.pads(force, error).error, [0.3, 0.4, np.inf, 0.5])
+    np.testing.assert_allclose(with_settings(tracker, tail=share).pads(force, error).error, expected)
+    loads = replace(tracker.settings.loads, width=1e-4)  # whose tails reach no pad
+    for other in ({"tail": share, "loads": loads}, {"tail": 0.0}):
+        found = with_settings(tracker, **other).pads(force, error).error
+        np.testing.assert_allclose(found, [0.3, 0.4, np.inf, 0.5])
 
 
 def test_missing_readings_are_left_out(tracker, frame_of, followed):
