@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
-from scipy.spatial import KDTree
+from scipy.spatial import cKDTree
 
 from .._compile import require_known
 from ..imaging.absolute.background import UntouchedSheet, fitted_sheet, untouched_frame
@@ -46,7 +46,7 @@ UNEXPECTED, SURPRISING = 4.0, 25.0
 MOST_GAIN = 4.0
 # A frame that no event explains is asked about again after `Tracking.patience`, or where it is so much worse.
 WORSE = 1.3
-# Widths of a load beyond which no pad feels it.
+# Usual widths of a load beyond which no pad feels it.
 REACH = 3.0
 # Part of the signal of contacts that a frame may be off, for contacts that moved on while frames waited for too long.
 UNSEEN = 0.01
@@ -282,10 +282,9 @@ class Tracker:
         return frame
 
     def pads(self, forces: Float[ArrayLike, " pads"] | None, errors: Float[ArrayLike, " pads"] | None) -> Pads:
-        """Forces on pads as the programs take them; raises InverseError if an array has another shape.
+        """Forces on pads as the programs take them, with `_tails` in their errors.
 
-        How much of a load lies on the pads beside depends on its shape, which is not known: where a pad bears no load,
-        it may still feel the tail of a contact on another. So their errors hold a share of the load beside them.
+        Raises InverseError if an array has another shape.
         """
         count = self.filter.sheet.pad_area.shape[1]
         if forces is None:
@@ -299,17 +298,24 @@ class Tracker:
         if not (error[known] > 0).all():
             raise InverseError("a pad has the standard error zero; give a number above zero, in newtons")
         force = np.where(known, force, 0)
-        tails = self.settings.tail * (self._beside @ np.maximum(force, 0))
-        return Pads(jnp.asarray(force), jnp.asarray(np.where(known, np.hypot(error, tails), np.inf)))
+        error = np.hypot(error, self._tails @ np.maximum(force, 0))
+        return Pads(jnp.asarray(force), jnp.asarray(np.where(known, error, np.inf)))
 
     @cached_property
-    def _beside(self) -> Bool[np.ndarray, "pads pads"]:
-        """Which pads a load on a pad may reach: those within `REACH` usual widths of it."""
+    def _tails(self) -> Float[np.ndarray, "pads pads"]:
+        """Share of the load on each other pad by which the force on a pad may err, within `REACH` of it.
+
+        How much of a load lies on the pads beside depends on its shape, which is not known: a pad without a contact
+        may feel the tail of one on another pad.
+        """
+        count, tail = self.filter.sheet.pad_area.shape[1], self.settings.tail
+        if not tail:
+            return np.zeros((count, count))
         on, pixels = np.asarray(self.filter.sheet.pad_area) > 0, np.asarray(self.filter.sheet.pixels)
-        trees = [KDTree(pixels[own]) for own in on.T]
+        trees = [cKDTree(pixels[own]) for own in on.T]
         reach = REACH * self.settings.loads.width
         near = np.array([[one.count_neighbors(other, reach) > 0 for other in trees] for one in trees])
-        return near & ~np.eye(len(trees), dtype=bool)
+        return tail * (near & ~np.eye(count, dtype=bool))
 
     def _is_unexpected(self, now: Tracking, update: Update) -> bool:
         if float(update.surprise) >= SURPRISING:

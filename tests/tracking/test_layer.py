@@ -143,7 +143,7 @@ def told_directions(tracker, seed, count):
     whole = Near(*every, jnp.ones(elements, bool), jnp.ones(pixels, bool))
     shown = jax.jit(lambda contact, gain: sheet.shown(contact, gain, jnp.zeros(0, jnp.int32), whole))
     frame_of = np.linalg.pinv(np.asarray(tracker.filter.compress))
-    before = tracker.start(LearnedLayer.unknown(tracker.field)._replace(evidence=np.where(PRESS_VARIANCES, -1e3, 0.0)))
+    before = tracker.start(known_variance(0.0, tracker.field))
     for _ in range(count):
         gain, place = rng.normal(size=size), rng.uniform(0.02, 0.18, 2)
         one = load(*place, rng.uniform(4, 25), np.hypot(rng.uniform(0.008, 0.018), 0.006))
@@ -174,10 +174,7 @@ def test_a_press_states_the_error_of_the_gain_under_it(model, skin, blank):
 
 def test_the_effect_of_a_press_does_not_move_contacts_and_is_in_the_error_of_forces(tracker, frame_of):
     """Presses that differ by a variance of ten: readings hardly tell a force, pads do, and places stay as they are."""
-    layers = [
-        LearnedLayer.unknown(tracker.field)._replace(evidence=np.where(variance == PRESS_VARIANCES, 0.0, -1e3))
-        for variance in (MOST_EXPLAINED, 10.0)
-    ]
+    layers = [known_variance(variance, tracker.field) for variance in (MOST_EXPLAINED, 10.0)]
     frames = [frame_of([load(0.05, 0.06, max(force, 1e-6))]) for force in (0.0, 10.0, 10.0)]
     states = [tracker.start(layer) for layer in layers]
     for frame in frames:
@@ -284,9 +281,9 @@ def after_presses(rng, counts, variance):
             yield layer, true
 
 
-def known_variance(variance):
+def known_variance(variance, field=SMALL):
     """Nothing is learned but how far presses differ."""
-    return LearnedLayer.unknown(SMALL)._replace(evidence=np.where(variance == PRESS_VARIANCES, 0.0, -1e3))
+    return LearnedLayer.unknown(field)._replace(evidence=np.where(variance == PRESS_VARIANCES, 0.0, -1e3))
 
 
 def test_without_an_effect_of_the_press_the_layer_is_the_belief_of_the_press():
@@ -360,7 +357,7 @@ def test_a_sheet_that_is_wrong_looks_like_gain(model, tracker):
         pressed = true * loads.law.factor(load_pressure(one, model.centroids))
         return je.forward(model, pressed) - je.forward(model, true)
 
-    before = tracker.start(LearnedLayer.unknown(tracker.field)._replace(evidence=np.where(PRESS_VARIANCES, -1e3, 0.0)))
+    before = tracker.start(known_variance(0.0, tracker.field))
     layer, at = before.layer, np.stack(np.meshgrid(*2 * [np.linspace(0.04, 0.16, 5)]), -1).reshape(-1, 2)
     for place in at:
         one = jnp.array(load(*place, loads.force, loads.width))

@@ -69,13 +69,11 @@ def consider_covariance(
     root = lapack.cholesky(whitened @ whitened.T + jnp.eye(len(before), dtype=before.dtype), lower=True)
     # The model errs in each reading by itself.
     by_model = tracker.model_error * jnp.sqrt(square) / scale * whitened[:, : len(shown.readings)]
-    towards = jnp.concatenate([whitened @ bent.T, by_model], 1)
+    towards = jnp.concatenate([whitened @ bent.T, by_model, whitened @ of_modes.T], 1)
     moved = before[:, None] * lapack.cho_solve((root, True), towards)
-    own = moved[: contacts.size].reshape(count, SEEN, -1)
+    own, by_press = jnp.split(moved[: contacts.size].reshape(count, SEEN, -1), [towards.shape[1] - len(modes)], 2)
     found = jnp.einsum("kim,kjm->kij", own, own)
-    by_press = before[:, None] * lapack.cho_solve((root, True), whitened @ of_modes.T)
-    on_forces = jnp.sum(by_press[3 : contacts.size : SEEN] ** 2, 1)
-    return found.at[:, 3, 3].add(unexplained * on_forces)
+    return found.at[:, 3, 3].add(unexplained * jnp.sum(by_press[:, 3] ** 2, 1))
 
 
 class ConsiderErrors(NamedTuple):
