@@ -26,6 +26,7 @@ import numpy as np
 
 import calib
 import jaxeit as je
+from calib.calibration.evaluation import Evaluation
 from calib.live.loop import LiveControl, LiveSettings, run_live
 from calib.live.results import FrameResult
 from calib.record.device import Packets, SimulatedDevice, frame_packets
@@ -97,8 +98,21 @@ def made_up() -> calib.Calibration:
     pressure = np.tile(np.linspace(0, 4000, 64), (len(skin.pads), 1))
     noise = np.random.default_rng(0).normal(0, 0.05, 64)
     curves = calib.fit_curves(calib.Linear(), pressure, 5e-3 * pressure[0] + noise)
-    none: Any = None  # nothing was pressed
-    return calib.Calibration(skin, recon, je.pad_masks(skin, recon), curves, none, {}, simulated=True)
+    masks = je.pad_masks(skin, recon)
+    return calib.Calibration(skin, recon, masks, curves, nothing_pressed(len(skin.pads)), {}, simulated=True)
+
+
+def nothing_pressed(pads: int) -> Evaluation:
+    return Evaluation(
+        position=np.zeros((0, 2)),
+        estimated={},
+        force=np.zeros(0),
+        pressure=np.zeros((0, pads)),
+        pad_force=np.zeros((0, pads)),
+        image_sum=np.zeros(0),
+        centre=np.zeros(2),
+        held_out_by="",
+    )
 
 
 # --- processes beside the one that is measured

@@ -1067,7 +1067,7 @@ def stage(bench):
     """Where the indenter stands, at 20 Hz: over the site of the press of the time."""
     times = np.arange(0, bench.duration, 0.05)
     press = np.clip((times - bench.blank) // bench.timing.period, 0, len(bench.sites) - 1).astype(int)
-    return frame_packets(4, (times * S).astype(int), bench.sites[press].astype("f4"))
+    return frame_packets(4, (times * S).astype(int).tolist(), bench.sites[press].astype("f4"))
 
 
 @pytest.mark.slow
