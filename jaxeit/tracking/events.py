@@ -1,6 +1,6 @@
 """What may happen to contacts between two frames, as beliefs before the next one."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -46,6 +46,10 @@ class Hypothesis(NamedTuple):
                 belief = lengthened(self.belief, k, angle)
                 yield Hypothesis(belief, self.numbers, edges, prior - float(np.log(len(DIRECTIONS))))
 
+    def elsewhere(self, k: int, belief: Belief, prior: float) -> "Hypothesis":
+        """Contact k is round and elsewhere."""
+        return Hypothesis(belief, self.numbers, (*self.edges[:k], False, *self.edges[k + 1 :]), prior)
+
     def joined(self, j: int, k: int, prior: float) -> "Hypothesis":
         """Contacts j and k, the later one, are one edge."""
         left, edges = self.without(k, prior), (*self.edges[:j], True, *self.edges[j + 1 :])
@@ -66,21 +70,34 @@ class Events:
         """Log of the prior probability of an event within some seconds."""
         return float(np.log(self._settings.birth_rate * seconds))
 
+    def anywhere(self, seconds: float) -> float:
+        """Log of the prior probability that a contact has begun within some seconds, in units of the fit's prior.
+
+        The prior of a place is even over the skin, that of the fit is normal about where it begins.
+        """
+        return self.rare(seconds) + float(np.log(2 * np.pi * PLACE**2 / self._area))
+
     def possible(
-        self, now: Hypothesis, begun: int, place: Float[np.ndarray, "2"], seconds: float
+        self,
+        now: Hypothesis,
+        begun: int,
+        place: Float[np.ndarray, "2"],
+        instead: Sequence[Float[np.ndarray, "2"]],
+        seconds: float,
     ) -> Iterator[Hypothesis]:
         """What may have happened to contacts within some seconds.
 
         Args:
             begun: number of contacts so far.
             place: where a contact would explain most of what the contacts leave of the frame, m.
+            instead: the same where the others leave it, for each contact.
         """
-        rare, count = self.rare(seconds), len(now.numbers)
+        rare, anywhere, count = self.rare(seconds), self.anywhere(seconds), len(now.numbers)
         if count < self._settings.most:
-            # The prior of a place is even over the skin, that of the fit is normal about where it begins.
-            even = float(np.log(2 * np.pi * PLACE**2 / self._area))
             belief = self.with_contact(now.belief, place)
-            yield Hypothesis(belief, (*now.numbers, begun + 1), (*now.edges, False), rare + even)
+            yield Hypothesis(belief, (*now.numbers, begun + 1), (*now.edges, False), anywhere)
+        for k, other in enumerate(instead):
+            yield now.elsewhere(k, self.beginning(now.belief, k, other), rare + anywhere)
         if count:
             yield now._replace(belief=jumped(now.belief), prior=rare)
             away = np.asarray(now.belief.contacts)[:, :2] - place
@@ -92,16 +109,24 @@ class Events:
 
     def with_contact(self, belief: Belief, place: Float[np.ndarray, "2"]) -> Belief:
         """The belief with a contact more, that begins about a place, m."""
+        return inserted(belief, *self._beginning(place))
+
+    def beginning(self, belief: Belief, k: int, place: Float[np.ndarray, "2"]) -> Belief:
+        """The belief with contact k begun anew about a place, m."""
+        return replaced(belief, k, *self._beginning(place))
+
+    def _beginning(self, place: Float[np.ndarray, "2"]) -> tuple[np.ndarray, np.ndarray]:
+        """The numbers of a contact that begins about a place, m, and their standard deviations."""
         row = np.array([*place, *self._usual, 0.0, 0.0, 0.0, 0.0])
-        spread = np.array([PLACE, PLACE, *self._spread, ROUND, ROUND, VELOCITY, VELOCITY])
-        return inserted(belief, row, spread)
+        return row, np.array([PLACE, PLACE, *self._spread, ROUND, ROUND, VELOCITY, VELOCITY])
 
 
 def without(belief: Belief, k: int) -> Belief:
     """Without contact k."""
     kept = np.delete(np.arange(len(belief.covariance)), np.s_[SIZE * k : SIZE * (k + 1)])
     contacts = np.delete(np.asarray(belief.contacts), k, 0)
-    return Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(np.asarray(belief.covariance)[np.ix_(kept, kept)]))
+    covariance = np.asarray(belief.covariance)[np.ix_(kept, kept)]
+    return belief._replace(contacts=jnp.asarray(contacts), covariance=jnp.asarray(covariance))
 
 
 def inserted(belief: Belief, row: np.ndarray, spread: np.ndarray) -> Belief:
@@ -113,7 +138,16 @@ def inserted(belief: Belief, row: np.ndarray, spread: np.ndarray) -> Belief:
     covariance[np.ix_(kept, kept)] = old
     covariance[place : place + SIZE, place : place + SIZE] = np.diag(spread**2)
     contacts = np.concatenate([np.asarray(belief.contacts), row[None]]).astype(old.dtype)
-    return Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(covariance))
+    return belief._replace(contacts=jnp.asarray(contacts), covariance=jnp.asarray(covariance))
+
+
+def replaced(belief: Belief, k: int, row: np.ndarray, spread: np.ndarray) -> Belief:
+    """With another contact in the place of contact k, that is independent of all else."""
+    contacts, covariance, own = np.array(belief.contacts), np.array(belief.covariance), SIZE * k + np.arange(SIZE)
+    contacts[k] = row
+    covariance[own] = covariance[:, own] = 0
+    covariance[own, own] = spread**2
+    return belief._replace(contacts=jnp.asarray(contacts), covariance=jnp.asarray(covariance))
 
 
 def jumped(belief: Belief) -> Belief:
@@ -130,7 +164,7 @@ def lengthened(belief: Belief, k: int, angle: float) -> Belief:
     contacts[k, 4:6] = HALF * np.cos(angle), HALF * np.sin(angle)
     contacts[k, 2] -= NARROWER
     covariance[own, own] += EDGE**2
-    return Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(covariance))
+    return belief._replace(contacts=jnp.asarray(contacts), covariance=jnp.asarray(covariance))
 
 
 def joined(belief: Belief, first: int, second: int) -> Belief:
@@ -143,4 +177,4 @@ def joined(belief: Belief, first: int, second: int) -> Belief:
     contacts[first, 6:] = pair[:, 6:].mean(0)
     own = np.arange(SIZE * first, SIZE * (first + 1))
     covariance[own, own] += EDGE**2
-    return without(Belief(jnp.asarray(contacts), belief.gain, jnp.asarray(covariance)), second)
+    return without(belief._replace(contacts=jnp.asarray(contacts), covariance=jnp.asarray(covariance)), second)

@@ -1,8 +1,13 @@
 """A frame that is not expected is looked into: what may have happened to the contacts before it?
 
-The belief before the frame is updated in several ways: as it is; with contacts that have jumped; without one of them;
-with one, or two, that are an edge; with one more. The way under which the frame was most probable is taken, with the
-rates of such events as prior (evidence by Laplace's approximation, MacKay 1992, Neural Comput. 4).
+The belief before the frame is updated in several ways: as it is; with contacts that have jumped; with one of them
+elsewhere; without one of them; with one, or two, that are an edge; with one more. The way under which the frame was
+most probable is taken, with the rates of such events as prior (evidence by Laplace's approximation, MacKay 1992, Neural
+Comput. 4).
+
+As a contact begins, what the model errs by may look like a second one, and frames that come later do not contradict:
+two contacts explain what one does. So where the share of contacts in their force stays unknown they are counted again:
+all of them begin anew in one frame, against one fewer.
 
 This is many updates. They are done in pieces of a few evaluations, so that a live view does some of them in each frame.
 Meanwhile it goes on as if nothing had happened, and keeps the frames, some standing for several. When it is known what
@@ -13,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .belief.filter import Update
+from .belief.filter import SIZE, Update
 from .belief.programs import Programs
 from .events import Events, Hypothesis
 from .tracks import MOST_PATIENCE, PATIENCE, Backlog, Look, Seen, Tracking, Trial
@@ -22,6 +27,9 @@ from .tracks import MOST_PATIENCE, PATIENCE, Backlog, Look, Seen, Tracking, Tria
 FAINT, FAINT_FRAMES = 4.0, 2
 # Signal of a contact that begins beside others, at least: in standard deviations of the noise, and over that of all.
 MIN_LOUDNESS, RIPPLE = 12.0, 0.05
+# Contacts may be fewer where the log of a force has a larger standard deviation. They are counted again so many times
+# as often as a frame that no event explains is looked into.
+DOUBTED, DOUBTS = 0.5, 4
 # Frames that wait while another is looked into; where there are more, each stands for two. An even number.
 KEPT = 8
 # Events that one frame may show.
@@ -37,6 +45,36 @@ def begun(before: Tracking, otherwise: Tracking, seen: Seen, unfinished: bool = 
         unfinished: whether the update that led to the latter had not converged.
     """
     return Look(seen, before, otherwise, Trial(_as_is(before)), EVENTS, unfinished)
+
+
+def is_doubted(now: Tracking) -> bool:
+    """Whether contacts are to be counted again: the force of one beside others is hardly known."""
+    return len(now.numbers) > 1 and now.since >= now.patience // DOUBTS and bool(_doubted(now))
+
+
+def _doubted(now: Tracking) -> list[int]:
+    """Which contacts may be none."""
+    forces = SIZE * np.arange(len(now.numbers)) + 3
+    errors = np.sqrt(np.diag(np.asarray(now.belief.covariance))[forces])
+    return [k for k, error in enumerate(errors) if error > DOUBTED and not now.edges[k]]
+
+
+def recounted(before: Tracking, otherwise: Tracking, seen: Seen, programs: Programs, events: Events) -> Look:
+    """Begin to look whether one contact fewer explains a frame; arguments as for `begun`."""
+    places, anew = np.asarray(before.belief.contacts)[:, :2], _as_is(before)
+    for k, place in enumerate(places):
+        anew = anew.elsewhere(k, events.beginning(anew.belief, k, place), 0.0)
+
+    def fewer(k: int) -> Trial:
+        """One contact in the place of contact k and the one beside it."""
+        beside = int(np.argsort(np.linalg.norm(places - places[k], axis=1))[1])
+        first, second = sorted((k, beside))
+        left = anew.without(second, 0.0)
+        place = programs.unexplained_place(left.without(first, 0.0).belief, seen.dv, seen.pads)
+        return Trial(left.elsewhere(first, events.beginning(left.belief, first, place), 0.0))
+
+    best = Trial(anew._replace(prior=events.anywhere(seen.seconds)))
+    return Look(seen, before, otherwise, best, EVENTS, trials=tuple(map(fewer, _doubted(before))))
 
 
 def meanwhile(backlog: Backlog, seen: Seen) -> Backlog:
@@ -110,9 +148,11 @@ def _is_explained(careful: Update, size: int, rare: float) -> bool:
 
 def _trials(look: Look, careful: Update, programs: Programs, events: Events) -> tuple[Trial, ...]:
     """What may have happened."""
-    place = programs.unexplained_place(careful.belief, look.seen.dv, look.seen.pads)
-    possible = events.possible(_as_is(look.before), look.before.begun, place, look.seen.seconds)
-    return tuple(map(Trial, possible))
+    before, seen = _as_is(look.before), look.seen
+    place = programs.unexplained_place(careful.belief, seen.dv, seen.pads)
+    others = [before.without(k, 0.0).belief for k in range(len(before.numbers))]
+    instead = [programs.unexplained_place(belief, seen.dv, seen.pads) for belief in others]
+    return tuple(map(Trial, events.possible(before, look.before.begun, place, instead, seen.seconds)))
 
 
 def _concluded(look: Look, trial: Trial, programs: Programs) -> Update:

@@ -80,6 +80,8 @@ def prepare_filter(
         coat_error=put(_coat_share(sheet, settings) if coat else 0),
         persistence=put(settings.persistence),
         rates=put(_rates(settings)),
+        gain_rate=put(settings.gain_rate / settings.level),
+        tail=put(settings.tail),
         shape=put(loads.shape),
         spread=put([PLACE, PLACE, loads.width_spread, loads.force_spread]),
         active_modes=settings.modes,

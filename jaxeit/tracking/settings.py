@@ -23,10 +23,11 @@ class TrackerSettings:
     |--------------------------------------------------------------------------------|---------|-----------|
     | loads: law of pressure, gain of the contact layer, usual sizes, forces, and shapes, here of 0.15 |  |      |
     | level: standard deviation of the log of the gain that all places share         | 0.3     | 1         |
-    | tail: share of the load on pads beside it by which the force on a pad may err  | 0       | 1         |
+    | tail: part by which forces on pads may err of what a load twice as wide would change them | 0.3 | 1     |
     | persistence: time over which errors of mesh and load shape stay as they are    | 0.5     | s         |
     | acceleration: change of a contact's velocity                                   | 0.3     | m/s/sqrt(s) |
     | width_rate, force_rate: change of the logs of width and force                  | 0.5, 5  | 1/sqrt(s) |
+    | gain_rate: change of the log of the gain during a press, within what was known of it before | 0.1 | 1/sqrt(s) |
     | birth_rate: of contacts anywhere on the skin                                   | 0.5     | 1/s       |
     | most: contacts followed at once                                                | 3       |           |
     | unknowns: of the mesh around a contact that are solved anew in each frame      | 96      |           |
@@ -42,11 +43,12 @@ class TrackerSettings:
 
     loads: LoadSettings = field(default_factory=partial(LoadSettings, shape=SHAPE))
     level: float = 0.3
-    tail: float = 0.0
+    tail: float = 0.3
     persistence: float = 0.5
     acceleration: float = 0.3
     width_rate: float = 0.5
     force_rate: float = 5.0
+    gain_rate: float = 0.1
     birth_rate: float = 0.5
     most: int = 3
     unknowns: int = 96
@@ -60,8 +62,9 @@ class TrackerSettings:
         for name in ("level", "persistence", "acceleration", "width_rate", "force_rate", "birth_rate"):
             if not 0 < getattr(self, name) < np.inf:
                 raise InverseError(f"{name} is {getattr(self, name)}; give a number above zero")
-        if not 0 <= self.tail < np.inf:
-            raise InverseError(f"tail is {self.tail}; give zero or a number above it")
+        for name in ("tail", "gain_rate"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise InverseError(f"{name} is {getattr(self, name)}; give zero or a number above it")
         for name in ("most", "unknowns", "modes", "columns", "pixels"):
             value = getattr(self, name)
             if value is not None and value < 1:

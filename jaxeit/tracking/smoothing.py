@@ -50,9 +50,9 @@ class State(NamedTuple):
 
 def transition(tracker: Tracker, seconds: float) -> Transition:
     """How the filter predicts a contact so many seconds later."""
-    gain = jnp.zeros(0, tracker.filter.places.dtype)
-    unit = jnp.eye(SIZE, dtype=gain.dtype)
-    found = predicted(tracker.filter, Belief(unit, gain, jnp.zeros((SIZE**2,) * 2, gain.dtype)), jnp.asarray(seconds))
+    unit, none = jnp.eye(SIZE, dtype=tracker.filter.places.dtype), partial(jnp.zeros, dtype=tracker.filter.places.dtype)
+    numbers = Belief(unit, none(1), none((SIZE**2 + 1,) * 2), level=none(2).at[1].set(1))
+    found = predicted(tracker.filter, numbers, jnp.asarray(seconds))
     return Transition(np.asarray(found.contacts).T, np.asarray(found.covariance)[:SIZE, :SIZE])
 
 

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
-from scipy.spatial import cKDTree
 
 from .._compile import require_known
 from ..imaging.absolute.background import UntouchedSheet, fitted_sheet, untouched_frame
@@ -28,10 +27,12 @@ from .looks import (
     calmer,
     caught_up,
     has_ended,
+    is_doubted,
     is_finite,
     is_given_up,
     looked,
     meanwhile,
+    recounted,
     settled,
     without_contacts,
 )
@@ -46,8 +47,6 @@ UNEXPECTED, SURPRISING = 4.0, 25.0
 MOST_GAIN = 4.0
 # A frame that no event explains is asked about again after `Tracking.patience`, or where it is so much worse.
 WORSE = 1.3
-# Usual widths of a load beyond which no pad feels it.
-REACH = 3.0
 # Part of the signal of contacts that a frame may be off, for contacts that moved on while frames waited for too long.
 UNSEEN = 0.01
 
@@ -96,8 +95,9 @@ class Tracker:
 
     def _untouched(self, layer: LearnedLayer) -> Belief:
         """The belief without contacts; its gain is that under the next press."""
-        put = partial(jnp.asarray, dtype=self.filter.places.dtype)
-        return Belief(put(np.zeros((0, SIZE))), put(layer.mean), put(layer.before_press))
+        put, covariance = partial(jnp.asarray, dtype=self.filter.places.dtype), layer.before_press
+        level = np.array([layer.mean[0], covariance[0, 0]])
+        return Belief(put(np.zeros((0, SIZE))), put(layer.mean), put(covariance), put(level))
 
     def learned(self, now: Tracking) -> LearnedLayer:
         """What contacts have told of the gain of the contact layer up to now, to `start` with another time."""
@@ -264,10 +264,13 @@ class Tracker:
         """The contacts after a frame in which nothing happens, and the look into it if it is not expected."""
         moved, update = self.programs.followed(now.belief, *seen)
         after = settled(now, update)
-        if not is_finite(update) or not self._is_unexpected(now, update):
+        unexpected = self._is_unexpected(now, update)
+        if not is_finite(update) or not (unexpected or is_doubted(now)):
             return replace(after, since=now.since + 1), None
-        after = replace(after, since=0, misfit=float(update.misfit))
-        return after, begun(replace(now, belief=moved), after, seen, unfinished=not bool(update.converged))
+        before, after = replace(now, belief=moved), replace(after, since=0, misfit=float(update.misfit))
+        if unexpected:
+            return after, begun(before, after, seen, unfinished=not bool(update.converged))
+        return after, recounted(before, after, seen, self.programs, self.events)
 
     def _until_now(self, after: Tracking, waiting: tuple[Seen, ...]) -> Tracking:
         """What is believed while frames wait: the contacts after the last event have moved on."""
@@ -282,10 +285,7 @@ class Tracker:
         return frame
 
     def pads(self, forces: Float[ArrayLike, " pads"] | None, errors: Float[ArrayLike, " pads"] | None) -> Pads:
-        """Forces on pads as the programs take them, with `_tails` in their errors.
-
-        Raises InverseError if an array has another shape.
-        """
+        """Forces on pads as the programs take them; raises InverseError if an array has another shape."""
         count = self.filter.sheet.pad_area.shape[1]
         if forces is None:
             return Pads(jnp.zeros(count), jnp.full(count, jnp.inf, float))  # as those that are known: no weak type
@@ -297,25 +297,7 @@ class Tracker:
         known = np.isfinite(force) & np.isfinite(error)
         if not (error[known] > 0).all():
             raise InverseError("a pad has the standard error zero; give a number above zero, in newtons")
-        force = np.where(known, force, 0)
-        error = np.hypot(error, self._tails @ np.maximum(force, 0))
-        return Pads(jnp.asarray(force), jnp.asarray(np.where(known, error, np.inf)))
-
-    @cached_property
-    def _tails(self) -> Float[np.ndarray, "pads pads"]:
-        """Share of the load on each other pad by which the force on a pad may err, within `REACH` of it.
-
-        How much of a load lies on the pads beside depends on its shape, which is not known: a pad without a contact
-        may feel the tail of one on another pad.
-        """
-        count, tail = self.filter.sheet.pad_area.shape[1], self.settings.tail
-        if not tail:
-            return np.zeros((count, count))
-        on, pixels = np.asarray(self.filter.sheet.pad_area) > 0, np.asarray(self.filter.sheet.pixels)
-        trees = [cKDTree(pixels[own]) for own in on.T]
-        reach = REACH * self.settings.loads.width
-        near = np.array([[one.count_neighbors(other, reach) > 0 for other in trees] for one in trees])
-        return tail * (near & ~np.eye(count, dtype=bool))
+        return Pads(jnp.asarray(np.where(known, force, 0)), jnp.asarray(np.where(known, error, np.inf)))
 
     def _is_unexpected(self, now: Tracking, update: Update) -> bool:
         if float(update.surprise) >= SURPRISING:
@@ -336,7 +318,7 @@ def bounded(now: Tracking) -> Tracking:
     own = now.belief.contacts.size
     covariance[own:] = covariance[:, own:] = 0
     covariance[own:, own:] = layer.before_press
-    return replace(now, belief=Belief(now.belief.contacts, jnp.asarray(layer.mean), jnp.asarray(covariance)))
+    return replace(now, belief=now.belief._replace(gain=jnp.asarray(layer.mean), covariance=jnp.asarray(covariance)))
 
 
 def prepare_tracker(

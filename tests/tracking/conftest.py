@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxeit as je
-from jaxeit.tracking import TrackerSettings, prepare_tracker
+from jaxeit.tracking import Tracker, TrackerSettings, prepare_tracker
 from jaxeit.tracking.belief.response import load_pressure
 
 SECONDS = 0.01
@@ -55,6 +57,13 @@ def cornered():
 
 def load(x, y, force, width=0.012):
     return [x, y, np.log(width), np.log(force), 0.0, 0.0]
+
+
+def with_filter(tracker, **settings):
+    """The tracker whose filters hold other numbers."""
+    given = {name: jnp.asarray(value) for name, value in settings.items()}
+    of_frames, of_presses = (replace(one, **given) for one in (tracker.filter, tracker.of_presses))
+    return Tracker(of_frames, of_presses, tracker.settings, tracker.area, tracker.field)
 
 
 def in_double_precision(tree):

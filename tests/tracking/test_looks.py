@@ -8,7 +8,8 @@ import pytest
 
 from jaxeit.tracking.belief.filter import PIECE, STEPS, Pads
 from jaxeit.tracking.belief.programs import Programs
-from jaxeit.tracking.looks import KEPT, LONGEST_WAIT, begun, looked, meanwhile, settled
+from jaxeit.tracking.events import jumped
+from jaxeit.tracking.looks import KEPT, LONGEST_WAIT, begun, is_doubted, looked, meanwhile, settled
 from jaxeit.tracking.tracks import MOST_PATIENCE, PATIENCE, Seen
 
 from .conftest import SECONDS, load
@@ -76,7 +77,7 @@ def test_contacts_are_told_a_few_frames_later_and_keep_their_numbers(followed):
     assert numbers[6:8] == [(1,)] * 2
     assert 8 < late < 8 + 35
     assert numbers[late:48] == [(1, 2)] * (48 - late)
-    assert numbers[54:60] == [(2,)] * 6  # of the other, some force is believed in for a while
+    assert numbers[56:60] == [(2,)] * 4  # of the other, some force is believed in for a while
     assert numbers[-1] == ()
     for k in range(late + 2, 48):
         for track, own in zip(states[k].tracks, truth(k), strict=True):
@@ -87,6 +88,46 @@ def test_a_look_ends_and_a_frame_is_looked_into_again_only_if_it_is_unexpected(f
     looking = [state.backlog is not None for state in followed[0]]
     assert looking[8]
     assert not all(looking[12:47])
+
+
+def test_a_contact_that_is_elsewhere_keeps_its_number(tracker, frame_of):
+    """Farther than a fit from its place would find it, and no second contact begins beside it."""
+    now = tracker.start()
+    for place in ((0.05, 0.06), (0.05, 0.06), (0.09, 0.12)):
+        now = tracker.step(now, frame_of([load(*place, 8.0)]), SECONDS)
+    (track,) = now.tracks
+    assert track.number == now.begun == 1
+    assert np.linalg.norm(track.position - place) < 1.5e-3
+
+
+def two_contacts(tracker, frame, places, doubted=True):
+    """Two contacts as a frame by itself leaves them, whose force may be hardly known."""
+    belief = tracker.start().belief
+    for place in places:
+        belief = tracker.events.with_contact(belief, np.asarray(place))
+    now = replace(tracker.start(), belief=belief, numbers=(1, 2), edges=(False,) * 2, faint=(0,) * 2, begun=2)
+    now = settled(now, tracker.programs.careful(belief, tracker.frame(frame), tracker.pads(None, None)))
+    return replace(now, belief=jumped(now.belief) if doubted else now.belief, since=PATIENCE)
+
+
+def test_two_contacts_that_are_one_are_counted_again(tracker, frame_of):
+    now = two_contacts(tracker, frame_of([load(0.06, 0.08, 10.0)]), [(0.055, 0.078), (0.066, 0.084)], doubted=False)
+    assert is_doubted(now)
+    for _ in range(2):
+        now = tracker.step(now, frame_of([load(0.06, 0.08, 10.0)]), SECONDS)
+    (track,) = now.tracks
+    assert track.number == 1
+    assert np.linalg.norm(track.position - [0.06, 0.08]) < 1e-3
+
+
+def test_two_contacts_that_are_counted_again_stay_two(tracker, frame_of):
+    truth = [load(0.06, 0.08, 10.0), load(0.085, 0.08, 8.0)]
+    now = two_contacts(tracker, frame_of(truth), [one[:2] for one in truth])
+    assert is_doubted(now)
+    assert not is_doubted(replace(now, since=0))
+    now = tracker.step(now, frame_of(truth), SECONDS)
+    assert now.numbers == (1, 2)
+    assert now.since == 0  # they were counted
 
 
 def test_what_no_event_explains_is_asked_about_less_and_less_often(tracker, frame_of):

@@ -1,16 +1,15 @@
 """Contacts followed through simulated frames, and the filter against a joint normal distribution."""
 
-from dataclasses import replace
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from jaxeit.imaging import InverseError
-from jaxeit.tracking import Tracker, TrackerSettings, prepare_tracker
-from jaxeit.tracking.belief.filter import SEEN, SIZE, Pads, active_numbers, predicted, updated
+from jaxeit.tracking import TrackerSettings, prepare_tracker
+from jaxeit.tracking.belief.filter import SEEN, SIZE, WIDER, Pads, active_numbers, predicted, telling_pads, updated
 
-from .conftest import SECONDS, SETTINGS, in_double_precision, load
+from .conftest import SECONDS, SETTINGS, in_double_precision, load, with_filter
 
 
 def silent(tracker):
@@ -90,17 +89,11 @@ def test_pads_tell_the_force(tracker, frame_of):
     assert track.log_force_error < 0.03
 
 
-def with_settings(tracker, **settings):
-    """The tracker with other settings, of those that its filter does not hold."""
-    given = replace(tracker.settings, **settings)
-    return Tracker(tracker.filter, tracker.of_presses, given, tracker.area, tracker.field)
-
-
 def test_a_tail_on_the_pad_beside_moves_no_contact(tracker, frame_of):
     """A load of another shape lies on the pad beside by 8 % more than the contact believes, 16 mm from its border."""
     frames = [frame_of([load(0.084, 0.05, max(force, 1e-6), 0.008)]) for force in (0.0, *4 * [10.0])]
     away = []
-    for one in (tracker, with_settings(tracker, tail=0.1)):
+    for one in (with_filter(tracker, tail=0.0), tracker):
         now = one.start()
         for frame, force in zip(frames, (0.0, *4 * [10.0]), strict=True):
             now = one.step(now, frame, SECONDS, force * np.array([0.9, 0.1, 0.0, 0.0]) + 1e-9, np.full(4, 0.1))
@@ -124,14 +117,36 @@ def test_a_drift_that_is_noise_begins_no_contact(model, skin, blank, tracker):
         assert (now.begun > 0) is contacts
 
 
-def test_errors_of_pads_hold_the_tails_of_loads_beside_them(tracker):
-    force, error, share = np.array([10.0, -1.0, np.nan, 2.0]), np.array([0.3, 0.4, 0.1, 0.5]), 0.2
-    expected = [np.hypot(0.3, 2 * share), np.hypot(0.4, 12 * share), np.inf, np.hypot(0.5, 10 * share)]
-    np.testing.assert_allclose(with_settings(tracker, tail=share).pads(force, error).error, expected)
-    loads = replace(tracker.settings.loads, width=1e-4)  # whose tails reach no pad
-    for other in ({"tail": share, "loads": loads}, {"tail": 0.0}):
-        found = with_settings(tracker, **other).pads(force, error).error
-        np.testing.assert_allclose(found, [0.3, 0.4, np.inf, 0.5])
+def test_pads_err_by_what_they_would_bear_of_a_wider_load(tracker):
+    """Of a load 12 mm from their border, whose integral is known."""
+    width, away, given = 0.008, 0.012, np.array([0.3, 0.4, 0.5, np.inf])
+    contacts = jnp.array([[*load(0.1 - away, 0.05, 10.0, width), 0.0, 0.0]])
+    near = tracker.filter.sheet.near(contacts[:, :SEEN])
+    found = telling_pads(tracker.filter, contacts, near, Pads(jnp.zeros(4), jnp.asarray(given))).error
+    beyond = norm.sf(away / np.array([width, WIDER * width])) * norm.cdf(0.05 / np.array([width, WIDER * width]))
+    expected = np.hypot(given[1], TrackerSettings().tail * 10 * np.diff(beyond)[0])
+    assert found[1] == pytest.approx(expected, rel=0.15)  # pixels, and what lies beyond those that are near
+    assert found[2] == pytest.approx(given[2], rel=0.05)
+    assert np.isinf(found[3])
+    same = telling_pads(tracker.filter, contacts.at[0, 3].set(-20.0), near, Pads(jnp.zeros(4), jnp.asarray(given)))
+    np.testing.assert_allclose(same.error, given, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("wanders", "told"), [(True, True), (False, False)])
+def test_a_gain_that_changes_during_a_press_does_not_bend_its_force(tracker, frame_of, wanders, told):
+    """As a layer touches late the gain grows by a tenth from the first newton to the last."""
+    if not wanders:
+        tracker = with_filter(tracker, gain_rate=0.0)
+    now, errors, rise = tracker.start(), [], np.linspace(0, 1, 25) ** 2
+    for share in (0.0, *rise[1:], *np.ones(25)):
+        force, gain = max(15 * share, 1e-6), 0.9 + 0.1 * share
+        pads = force * np.array([1.0, 0.0, 0.0, 0.0]) + 1e-9
+        now = tracker.step(now, frame_of([load(0.05, 0.06, force)], gain), 0.02, pads, np.hypot(0.1, 0.05 * pads))
+        if share > 0.5:
+            (track,) = now.tracks
+            errors.append(np.log(track.force / force) / track.log_force_error)
+    assert bool(np.mean(np.abs(errors) < norm.ppf(0.95)) > 0.85) is told
+    assert bool(abs(np.log(now.tracks[0].force / 15)) < 0.02) is told
 
 
 def test_missing_readings_are_left_out(tracker, frame_of, followed):
@@ -174,6 +189,7 @@ def test_a_belief_moves_by_the_integrated_random_walk(tracker, followed):
     once = predicted(filter_, belief, jnp.asarray(SECONDS))
     np.testing.assert_allclose(steps.contacts, once.contacts, rtol=1e-12)
     np.testing.assert_allclose(steps.covariance, once.covariance, rtol=1e-6, atol=1e-16)
+    np.testing.assert_allclose(steps.gain, once.gain, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -193,7 +209,8 @@ def test_wrong_frames_are_refused(tracker, given, said):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"level": 0.0}, {"tail": -0.1}, {"most": 0}, {"persistence": np.inf}, {"birth_rate": -1.0}]
+    "wrong",
+    [{"level": 0.0}, {"tail": -0.1}, {"gain_rate": np.nan}, {"most": 0}, {"persistence": np.inf}, {"birth_rate": -1.0}],
 )
 def test_wrong_settings_are_refused(wrong):
     with pytest.raises(InverseError, match=next(iter(wrong))):

@@ -4,13 +4,15 @@ An extended Kalman filter (Jazwinski 1970, ch. 8), whose update is iterated unti
 load (place, width, force, half length of an edge) with a velocity; loads add as pressure, and the law of the contact
 layer turns pressure times gain into conductivity, of which `Reanalysis` knows the readings. The gain ``exp(level +
 field)`` is the same in all frames, so its modes are part of the belief: the uncertainty of a place that the gain causes
-does not shrink while a contact rests, and the gain is learned where contacts move.
+does not shrink while a contact rests, and the gain is learned where contacts move. The level alone may wander during a
+press, since a layer that follows another law looks like another gain under another force.
 
 Only the parameters that a frame tells of are active in an update: places, widths, forces, half lengths, the level and
 the modes around contacts. With their covariance ``P = C C^T`` the update minimises ``|y - h|^2 / s^2 + |z|^2`` over z,
 where ``C z`` is the change of the active parameters; all others follow by their covariance with these.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -34,6 +36,8 @@ PLACE = 0.012
 ROUND = 1e-4
 # Share of a load on pads that tell forces, from which the pads tell the force of a contact.
 TOLD = 0.25
+# How many times as wide a load is whose tails pads may feel.
+WIDER = 2.0
 # Load on a pad that counts as none, N.
 NO_LOAD = 1e-6
 # Where a step is expected to lower half of chi-square by no more than this, it is taken, and the next one is left out:
@@ -68,11 +72,13 @@ class Belief(NamedTuple):
     | contacts: x, y, log width, log force, half an edge (2), velocity (2)     | (K, 8)   | mixed |
     | gain: level, then modes of the field, in units of their prior deviations | (g,)     | 1     |
     | covariance of contacts and gain                                          | (n, n)   | mixed |
+    | level: mean and variance of the level before the contacts of now         | (2,)     | 1     |
     """
 
     contacts: Float[Array, "K 8"]
     gain: Float[Array, " g"]
     covariance: Float[Array, "n n"]
+    level: Float[Array, "2"]
 
 
 class Update(NamedTuple):
@@ -127,9 +133,11 @@ class ContactFilter(eqx.Module):
     | model_error: part of the signal by which mesh and contact layer err      | ()               | 1    |
     | coat_error: part of the signal by which an unknown coat makes it err     | ()               | 1    |
     | persistence of these errors                                              | ()               | s    |
+    | tail: part of what wider loads would change pads, by which pads may err  | ()               | 1    |
     | shape: standard deviation of each moment of a load's shape               | ()               | 1    |
     | spread: of place (2), log width and log force before a contact is seen   | (4,)             | m, 1 |
     | rates: random walk of each number of a contact                           | (8,)             | per sqrt(s) |
+    | gain_rate: random walk of the level, in its prior standard deviations    | ()               | per sqrt(s) |
     """
 
     finder: ContactFinder
@@ -140,6 +148,8 @@ class ContactFilter(eqx.Module):
     coat_error: Float[Array, ""]
     persistence: Float[Array, ""]
     rates: Float[Array, "8"]
+    gain_rate: Float[Array, ""]
+    tail: Float[Array, ""]
     shape: Float[Array, ""]
     spread: Float[Array, "4"]
     active_modes: int = eqx.field(static=True)
@@ -152,8 +162,14 @@ class ContactFilter(eqx.Module):
 
 @verb
 def predicted(tracker: ContactFilter, belief: Belief, seconds: Float[Array, ""]) -> Belief:
-    """The belief so many seconds later: contacts move on, and may change."""
+    """The belief so many seconds later: contacts move on, and may change.
+
+    What the contacts of now have told of the level is forgotten as they change: the level follows an
+    Ornstein-Uhlenbeck process about what was known of it before them.
+    """
     count, size = len(belief.contacts), belief.contacts.size
+    if not count:
+        return belief
     step = jnp.eye(SIZE).at[:2, 6:].set(seconds * jnp.eye(2))
     # A velocity that walks at random: the integrated Wiener process, exactly.
     walk = jnp.diag(tracker.rates**2 * seconds)
@@ -164,7 +180,13 @@ def predicted(tracker: ContactFilter, belief: Belief, seconds: Float[Array, ""])
     rows = belief.covariance.at[:size].set(whole @ belief.covariance[:size])
     both = rows.at[:, :size].set(rows[:, :size] @ whole.T)
     covariance = both.at[:size, :size].add(jnp.kron(jnp.eye(count), walk))
-    return Belief(belief.contacts @ step.T, belief.gain, covariance)
+    mean, variance = belief.level
+    kept = jnp.exp(-0.5 * tracker.gain_rate**2 * seconds / variance)
+    forgotten = (
+        covariance.at[size].multiply(kept).at[:, size].multiply(kept).at[size, size].add((1 - kept**2) * variance)
+    )
+    gain = belief.gain.at[0].set(mean + kept * (belief.gain[0] - mean))
+    return belief._replace(contacts=belief.contacts @ step.T, gain=gain, covariance=forgotten)
 
 
 class _Problem(NamedTuple):
@@ -271,17 +293,23 @@ def _problem(
 
 
 def telling_pads(tracker: ContactFilter, contacts: Float[Array, "K 8"], near: Near, pads: Pads) -> Pads:
-    """Pads without those that mostly bear contacts with less than `TOLD` of their load on pads that tell forces.
+    """Pads with the errors of what they tell of contacts; infinite for pads that hardly tell any.
 
-    Such a pad bears the tail of a load, and how much lies there depends on the shape of the load, which is not known:
-    as where the pad under a contact is dead, and those beside it tell forces. The whole force would err tenfold. While
+    How much of a load lies on the pads beside it depends on its shape, which is not known: foam spreads a load farther
+    than it makes the layer conduct. So pads may err by a part of what a load `WIDER` would change them.
+
+    A pad that mostly bears contacts with less than `TOLD` of their load on pads that tell forces bears their tails, as
+    where the pad under a contact is dead, and those beside it tell forces. The whole force would err tenfold. While
     there is such a contact, pads without any load count as bearing it.
     """
-    loads = tracker.sheet.on_pads(contacts[:, :SEEN], near)
+    own = contacts[:, :SEEN]
+    loads = tracker.sheet.on_pads(own, near)
+    spread = tracker.sheet.on_pads(own.at[:, 2].add(math.log(WIDER)), near) - loads
+    error = jnp.sqrt(pads.error**2 + tracker.tail**2 * jnp.sum(spread**2, 0))
     told = jnp.sum(jnp.where(jnp.isfinite(pads.error), loads, 0), 1) >= TOLD * jnp.exp(contacts[:, 3])
     of_told = jnp.sum(jnp.where(told[:, None], loads, 0), 0)
     of_others = jnp.sum(jnp.where(told[:, None], 0, loads + NO_LOAD), 0)
-    return pads._replace(error=jnp.where(of_told >= of_others, pads.error, jnp.inf))
+    return pads._replace(error=jnp.where(of_told >= of_others, error, jnp.inf))
 
 
 def _scales(
@@ -446,7 +474,8 @@ def _followed(problem: _Problem, z: Float[Array, " a"], root: Float[Array, "a a"
     covariance = belief.covariance - across.T @ (learned @ across)
     flat = jnp.concatenate([belief.contacts.ravel(), belief.gain]) + across.T @ z
     size = belief.contacts.size
-    return Belief(flat[:size].reshape(-1, SIZE), flat[size:], 0.5 * (covariance + covariance.T))
+    found = 0.5 * (covariance + covariance.T)
+    return belief._replace(contacts=flat[:size].reshape(-1, SIZE), gain=flat[size:], covariance=found)
 
 
 def _loudness(normal: Float[Array, "a a"], factor: Float[Array, "a a"], count: int) -> Float[Array, " K"]:
