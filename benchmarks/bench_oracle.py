@@ -22,12 +22,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import norm
 
 import calib
 import jaxeit as je
 from calib.calibration import Calibration, KnownForces, OrdinaryUse, learn_layer
 from calib.calibration.application import FORMAT, TRACKS
 from calib.calibration.evaluation import Evaluation
+from calib.calibration.localisation.contact_tracks import ABOUT
 from calib.calibration.localisation.ellipses import INSIDE_90
 from calib.fitting.validation import rmse
 from calib.session import Session, open_archive
@@ -163,54 +165,73 @@ OTHER_TIPS = Bench(places=50, levels=(10.0,))
 
 
 def tracks(run: Run) -> Iterator[Row]:
-    """Places of followed contacts, second ones that were none, and coverage, for each preparation of the tracker."""
-    bench, seeds = (SMOKE, (31,)) if run.smoke else (replace(FULL, levels=(8.0, 16.0), places=60), (33, 34))
-    rows = []
-    for seed in seeds:
-        for name, faults in run.sizes(list(FOLLOWED.items()), [("as simulated", Faults())]):
-            skin = replace(bench, skin_seed=seed)
-            with _recorded(skin, faults, seed=1) as session:
-                calibration = calib.calibrate([session], recipe=DRAFT)
-            ways = {"the tracker's own": replace(calibration, probes=None), "of the calibration's presses": calibration}
-            places = skin.places if run.smoke else 100
-            with _recorded(replace(skin, places=places, levels=(8.0,)), faults, seed=2) as session:
-                try:
-                    ways["the same, layer learned"] = learn_layer(calibration, session)
-                except calib.SessionError as error:
-                    print(error)
-            later = bench if run.smoke else OTHER_TIPS
-            with _recorded(replace(later, skin_seed=seed), faults, seed=3) as session:
-                rows += [{"skin": name, "model error": way} | _followed(c, session) for way, c in ways.items()]
-            print(*rows[-len(ways) :], sep="\n", flush=True)
+    """Followed contacts, for each preparation of the tracker: places, forces, coverage, and seconds that were none."""
+    seeds = (31,) if run.smoke else (37, 38)
+    rows = [row for seed in seeds for row in followed_on(seed, run)]
     yield {"tracks": group_means(rows, "skin", "model error", count="skins")}
 
 
+def followed_on(seed: int, run: Run) -> Iterator[Row]:
+    """The rows of one skin."""
+    bench = SMOKE if run.smoke else replace(FULL, levels=(8.0, 16.0), places=60)
+    skin, later = (replace(one, skin_seed=seed) for one in (bench, bench if run.smoke else OTHER_TIPS))
+    for name, faults in run.sizes(list(FOLLOWED.items()), [("as simulated", Faults())]):
+        with _recorded(skin, faults, seed=1) as session:
+            calibration = calib.calibrate([session], recipe=DRAFT)
+        ways = {"the tracker's own": replace(calibration, probes=None), "of the calibration's presses": calibration}
+        places = skin.places if run.smoke else 100
+        with _recorded(replace(skin, places=places, levels=(8.0,)), faults, seed=2) as session:
+            try:
+                ways["the same, layer learned"] = learn_layer(calibration, session)
+            except calib.SessionError as error:
+                print(error)
+        with _recorded(later, faults, seed=3) as session:
+            for way, one in ways.items():
+                row = {"skin": name, "model error": way} | _followed(one, session)
+                print(row, flush=True)
+                yield row
+
+
 def _followed(calibration: Calibration, session: Session) -> Row:
-    """How contacts were followed in the holds of single presses."""
+    """How contacts were followed in the holds of single presses; the force is that of the contact that is nearest."""
     with tempfile.TemporaryDirectory() as folder:
         path = calib.apply(calibration, session, Path(folder) / "maps.h5", track=True)
         with open_archive(path, FORMAT) as file:
-            time, position, covariance = (
-                file.arrays[TRACKS + name].read() for name in ("time", "position", "position_covariance")
-            )
-    presses, errors, inside, extra = session.presses, [], [], 0
-    for begin, end, *place in zip(presses.t_hold0, presses.t_hold1, presses.x, presses.y, strict=True):
-        own = (time > begin) & (time < end)
-        if not own.any():
-            continue
-        away = position[own] - place
-        nearest = np.linalg.norm(away, axis=1)
-        extra += len(np.unique(time[own])) < own.sum()
-        errors.append(1e3 * nearest.mean())
-        square = np.einsum("ni,ni->n", away, np.linalg.solve(covariance[own], away[..., None])[..., 0])
-        inside.append((square < INSIDE_90**2).mean())
+            found = {name: file.arrays[TRACKS + name].read() for name in ABOUT}
+    presses, held = session.presses, []
+    for begin, end, *truth in zip(
+        presses.t_hold0, presses.t_hold1, presses.x, presses.y, presses.target_force, strict=True
+    ):
+        own = (found["time"] > begin) & (found["time"] < end)
+        if own.any():
+            held.append(_held({name: values[own] for name, values in found.items()}, *truth))
+    table = {name: np.array([one[name] for one in held], float) for name in held[0]}
     return {
-        "error_mm": float(np.mean(errors)),
-        "median_mm": float(np.median(errors)),
-        "p95_mm": float(np.quantile(errors, 0.95)),
-        "covered": float(np.mean(inside)),
-        "false_seconds": float(extra) / len(errors),
-        "missed": 1 - len(errors) / len(presses.x),
+        "error_mm": float(table["error_mm"].mean()),
+        "median_mm": float(np.median(table["error_mm"])),
+        "p95_mm": float(np.quantile(table["error_mm"], 0.95)),
+        "covered": float(table["covered"].mean()),
+        "force_bias": float(np.median(table["force_error"])),
+        "force_rms": float(np.sqrt(np.mean(table["force_error"] ** 2))),
+        "force_covered": float(table["force_covered"].mean()),
+        "false_seconds": float(table["several"].mean()),
+        "missed": 1 - len(held) / len(presses.x),
+    }
+
+
+def _held(found: dict[str, np.ndarray], x: float, y: float, force: float) -> Row:
+    """Errors of the rows of `tracks/...` in a hold; shares of them whose 90 % ellipses and intervals hold."""
+    away = found["position"] - [x, y]
+    square = np.einsum("ni,ni->n", away, np.linalg.solve(found["position_covariance"], away[..., None])[..., 0])
+    distance, (_, frame) = np.linalg.norm(away, axis=1), np.unique(found["time"], return_inverse=True)
+    nearest = [own[np.argmin(distance[own])] for own in (np.flatnonzero(frame == k) for k in range(frame.max() + 1))]
+    error = found["force"][nearest] - force
+    return {
+        "error_mm": 1e3 * distance.mean(),
+        "covered": (square < INSIDE_90**2).mean(),
+        "force_error": error.mean() / force,
+        "force_covered": (np.abs(error) < norm.ppf(0.95) * found["force_se"][nearest]).mean(),
+        "several": len(nearest) < len(frame),
     }
 
 
