@@ -65,9 +65,7 @@ def apply(
         RecordingError: if `check_session` finds an error in its skin, frames or pressures.
     """
     processing = processing or calibration.processing
-    if load_settings is not None and proposal is je.contacts.shipped_proposal:
-        proposal = None
-    proposed = chosen_proposal(proposal, calibration.skin, tell) if loads is not None else None
+    proposed = None if loads is None else chosen_proposal(proposal, calibration.skin, tell, load_settings)
     levels = resting_levels(session, calibration.skin, processing)
     ignored = accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED)
     calibration, outside = _agreement(calibration, session, levels)
