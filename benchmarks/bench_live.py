@@ -103,6 +103,7 @@ def made_up() -> calib.Calibration:
 
 
 def nothing_pressed(pads: int) -> Evaluation:
+    """Of a calibration without presses."""
     return Evaluation(
         position=np.zeros((0, 2)),
         estimated={},
