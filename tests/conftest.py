@@ -33,6 +33,7 @@ import calib.runtime
 import jaxeit as je
 import tests.mlir_contexts
 
+from .helpers import bound_maps
 from .scheduling import RoomScheduling
 
 pytest_plugins = ["tests.hard_cases"]
@@ -63,21 +64,14 @@ def pytest_xdist_make_scheduler(config, log):
     return RoomScheduling(config, log)
 
 
-MOST_MAPS = 40_000
-
-
 def pytest_runtest_setup():
     tests.annotations.begin_test()
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _bounded_maps():
-    """A compiled program takes some 14 memory maps, of which Linux allows a process 65,530; beyond them XLA crashes."""
     yield
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
-        jax.clear_caches()
-        gc.collect()
+    bound_maps()
 
 
 @pytest.fixture(scope="session")

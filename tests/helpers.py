@@ -1,5 +1,6 @@
 """Small skins whose answers are known."""
 
+import gc
 import math
 import os
 import re
@@ -18,6 +19,18 @@ from jaxeit.linalg.lapack import CUTS_STACKS
 
 # Recordings of others, which are not part of this project; tests that need them skip where they are not at hand.
 REAL_DATA = Path(os.environ.get("JAXEIT_REAL_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+MOST_MAPS = 40_000
+
+
+def bound_maps():
+    """Forget compiled programs: one takes some 14 memory maps, of which Linux allows a process 65,530; beyond them XLA
+    crashes. Done after each module, and in modules that compile more than so many."""
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 def compiled(function):

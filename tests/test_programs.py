@@ -15,6 +15,7 @@ import pytest
 import calib
 from calib.session import SessionFacts, SessionWriter, StreamFacts
 
+from .helpers import bound_maps
 from .record.test_recorder import both, journal
 from .tanks.instrument_files import goe_get
 from .tanks.rods import tank_with_rod
@@ -164,3 +165,4 @@ def test_programs_of_pages_that_go_on_from_a_calibration(calibrated, tmp_path, m
 @pytest.mark.parametrize("room", ["jaxeit", *(room for room in CONTENTS if room in SLOW and room not in FIRST)])
 def test_slow_programs_of_a_room(site, calibrated, room):
     run(site, room)
+    bound_maps()
