@@ -383,6 +383,19 @@ def test_many_fits_mapped_wait_for_no_thread(geometry, field):
     assert not spread_stacks(jax.jit(jax.vmap(one)).lower(many).as_text())
 
 
+@pytest.mark.parametrize("bumps", [1, 5, 12, 20])
+def test_principal_functions_are_the_same_on_every_machine(monkeypatch, bumps):
+    """LAPACK leaves the signs of eigenvectors open; coefficients in files are those of functions of one sign."""
+    field, eigh = PadEdgeSpline(bumps=bumps), np.linalg.eigh
+    expected = field.principal()
+    for seed in range(3):
+        signs = np.random.default_rng(seed).choice([-1.0, 1.0], bumps)
+        monkeypatch.setattr(np.linalg, "eigh", lambda a, signs=signs: (eigh(a)[0], eigh(a)[1] * signs))
+        np.testing.assert_array_equal(field.principal(), expected)
+    # Rounding does not decide: no coefficient of the other sign is nearly as large.
+    assert (expected.max(0) > (1 + 1e-4) * -expected.min(0)).all()
+
+
 @pytest.mark.parametrize("field", [PadEdge(), PadEdgeSpline()], ids=lambda f: f.name)
 def test_pulls_and_intervals_over_many_simulated_fits(skin, geometry, field):
     """1,000 sessions in one compiled call: pulls of mean 0 and deviation 1, and 90 % intervals that cover 90 %."""

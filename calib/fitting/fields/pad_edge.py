@@ -104,13 +104,15 @@ class PadEdgeSpline(PadEdge):
     def principal(self) -> Float[np.ndarray, "bumps bumps"]:
         """Coefficients of the B-splines in each principal function of the process, the largest first.
 
-        The prior variance of the functions is one, and that of the coefficients is one on the average.
+        The prior variance of the functions is one, and that of the coefficients is one on the average. The largest
+        coefficient of each is above zero: LAPACK leaves the signs open, and what one machine saves another one opens.
         """
         u = self.octaves()
         r = np.sqrt(5) * np.abs(u[:, None] - u) / self.length
         covariance = 2.0 ** -(u[:, None] + u) * (1 + r + r**2 / 3) * np.exp(-r)
         values, vectors = np.linalg.eigh(covariance / np.mean(np.diag(covariance)))
-        found: np.ndarray = (vectors * np.sqrt(np.maximum(values, 0)))[:, ::-1]
+        largest = vectors[np.abs(vectors).argmax(0), np.arange(self.bumps)]
+        found: np.ndarray = (vectors * np.sign(largest) * np.sqrt(np.maximum(values, 0)))[:, ::-1]
         return found
 
     def _bumps(self, metres: Float[Array, "..."]) -> Float[Array, "... bumps"]:
