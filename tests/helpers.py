@@ -19,8 +19,6 @@ from jaxeit.linalg.lapack import CUTS_STACKS
 
 # Recordings of others, which are not part of this project; tests that need them skip where they are not at hand.
 REAL_DATA = Path(os.environ.get("JAXEIT_REAL_DATA", Path(__file__).parents[2] / "shared" / "data"))
-
-
 MOST_MAPS = 40_000
 
 

@@ -46,10 +46,6 @@ class Hypothesis(NamedTuple):
                 belief = lengthened(self.belief, k, angle)
                 yield Hypothesis(belief, self.numbers, edges, prior - float(np.log(len(DIRECTIONS))))
 
-    def elsewhere(self, k: int, belief: Belief, prior: float) -> "Hypothesis":
-        """Contact k is round and elsewhere."""
-        return Hypothesis(belief, self.numbers, (*self.edges[:k], False, *self.edges[k + 1 :]), prior)
-
     def joined(self, j: int, k: int, prior: float) -> "Hypothesis":
         """Contacts j and k, the later one, are one edge."""
         left, edges = self.without(k, prior), (*self.edges[:j], True, *self.edges[j + 1 :])
@@ -85,7 +81,7 @@ class Events:
         instead: Sequence[Float[np.ndarray, "2"]],
         seconds: float,
     ) -> Iterator[Hypothesis]:
-        """What may have happened to contacts within some seconds.
+        """What may have happened to contacts within some seconds; what is least probable comes last.
 
         Args:
             begun: number of contacts so far.
@@ -96,8 +92,6 @@ class Events:
         if count < self._settings.most:
             belief = self.with_contact(now.belief, place)
             yield Hypothesis(belief, (*now.numbers, begun + 1), (*now.edges, False), anywhere)
-        for k, other in enumerate(instead):
-            yield now.elsewhere(k, self.beginning(now.belief, k, other), rare + anywhere)
         if count:
             yield now._replace(belief=jumped(now.belief), prior=rare)
             away = np.asarray(now.belief.contacts)[:, :2] - place
@@ -106,14 +100,17 @@ class Events:
             yield now.without(k, rare)
         for j, k in combinations(range(count), 2):
             yield now.joined(j, k, rare)
+        for k, other in enumerate(instead):
+            yield self.elsewhere(now, k, other, rare + anywhere)
 
     def with_contact(self, belief: Belief, place: Float[np.ndarray, "2"]) -> Belief:
         """The belief with a contact more, that begins about a place, m."""
         return inserted(belief, *self._beginning(place))
 
-    def beginning(self, belief: Belief, k: int, place: Float[np.ndarray, "2"]) -> Belief:
-        """The belief with contact k begun anew about a place, m."""
-        return replaced(belief, k, *self._beginning(place))
+    def elsewhere(self, now: Hypothesis, k: int, place: Float[np.ndarray, "2"], prior: float = 0.0) -> Hypothesis:
+        """Contact k is round and begins anew about a place, m."""
+        edges = (*now.edges[:k], False, *now.edges[k + 1 :])
+        return Hypothesis(replaced(now.belief, k, *self._beginning(place)), now.numbers, edges, prior)
 
     def _beginning(self, place: Float[np.ndarray, "2"]) -> tuple[np.ndarray, np.ndarray]:
         """The numbers of a contact that begins about a place, m, and their standard deviations."""

@@ -63,7 +63,7 @@ def recounted(before: Tracking, otherwise: Tracking, seen: Seen, programs: Progr
     """Begin to look whether one contact fewer explains a frame; arguments as for `begun`."""
     places, anew = np.asarray(before.belief.contacts)[:, :2], _as_is(before)
     for k, place in enumerate(places):
-        anew = anew.elsewhere(k, events.beginning(anew.belief, k, place), 0.0)
+        anew = events.elsewhere(anew, k, place)
 
     def fewer(k: int) -> Trial:
         """One contact in the place of contact k and the one beside it."""
@@ -71,7 +71,7 @@ def recounted(before: Tracking, otherwise: Tracking, seen: Seen, programs: Progr
         first, second = sorted((k, beside))
         left = anew.without(second, 0.0)
         place = programs.unexplained_place(left.without(first, 0.0).belief, seen.dv, seen.pads)
-        return Trial(left.elsewhere(first, events.beginning(left.belief, first, place), 0.0))
+        return Trial(events.elsewhere(left, first, place))
 
     best = Trial(anew._replace(prior=events.anywhere(seen.seconds)))
     return Look(seen, before, otherwise, best, EVENTS, trials=tuple(map(fewer, _doubted(before))))

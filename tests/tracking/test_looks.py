@@ -77,7 +77,7 @@ def test_contacts_are_told_a_few_frames_later_and_keep_their_numbers(followed):
     assert numbers[6:8] == [(1,)] * 2
     assert 8 < late < 8 + 35
     assert numbers[late:48] == [(1, 2)] * (48 - late)
-    assert numbers[56:60] == [(2,)] * 4  # of the other, some force is believed in for a while
+    assert numbers[54:60] == [(2,)] * 6  # of the other, some force is believed in for a while
     assert numbers[-1] == ()
     for k in range(late + 2, 48):
         for track, own in zip(states[k].tracks, truth(k), strict=True):
