@@ -3,7 +3,8 @@
 Frames come from the second simulator (`tests/oracles/bench`), which shares no code with the first, on skins of fresh
 seeds: protrusions one by one, Boussinesq's stress, tips of 12 mm, an uneven coat, noise 60 dB below the readings, 20 N.
 The skins are the testbed and the chest. The network has the shipped numbers for the skin, and sees neither the
-untouched frame nor the pads. Fits know the sheet from one untouched frame.
+untouched frame nor the pads. Fits know the sheet from one untouched frame. "Taught" fits also know what 16 presses of
+known place and force on the same skin tell (`jaxeit.contacts.learn_loads`): flat tips of 20 mm, 4 to 25 N.
 
 ways: single tips, equal pairs at 20 and 30 mm, edges of 40 and 60 mm, three tips, each with its error of place. "told":
 the most probable kind is the true one, and for two both places are nearer than half their distance. "several": more
@@ -21,6 +22,7 @@ unlike: frames from outside of the training, and how many of them are announced.
 """
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -34,20 +36,25 @@ from .clock import seconds
 from .harness import Question, Run
 from .problems import Pressed, fit_model, matched
 from .rows import Row, grouped, rounded
-from .second_simulator import Press, Wear, described, recorded as pressed
+from .second_simulator import FORCES, Press, Wear, described, recorded as pressed
 
 NAMES = ("one", "two, 1:1, 20 mm", "two, 1:1, 30 mm", "edge, 40 mm", "edge, 60 mm", "three")
 SHIPPED = ("testbed", "chest")
 TIP = 0.012  # m
 FIRST_SEED = 4300
 DEAD = 7  # electrode
-FITS, NETWORK, BOTH = "fits", "network", "both"
+FITS, TAUGHT, NETWORK, BOTH, BOTH_TAUGHT = "fits", "fits, taught", "network", "both", "both, taught"
+PRESSES, PRESS_TIP, MARGIN = 16, 0.02, 0.1  # that teach; m; of the sheet, beside which they lie
 
 
 def recorded(name: str, seed: int, given: list[Touch], misplaced: float = 0.0) -> Pressed:
     """A skin of a name and a seed under touches, by the second simulator."""
-    tips = [Press(touch.places[touch.loads > 0], touch.loads[touch.loads > 0], TIP) for touch in given]
-    return pressed(seed, tips, Wear(misplaced=misplaced), name)
+    return pressed(seed, tips(given), Wear(misplaced=misplaced), name)
+
+
+def tips(given: list[Touch]) -> list[Press]:
+    """The tips of touches."""
+    return [Press(touch.places[touch.loads > 0], touch.loads[touch.loads > 0], TIP) for touch in given]
 
 
 def touched(name: str, rng: np.random.Generator, singles: int, others: int) -> list[Touch]:
@@ -75,15 +82,20 @@ class Ready(NamedTuple):
 
     proposal: Proposal
     fitter: LoadFitter
+    taught: LoadFitter
     finder: je.ContactFinder
 
-    def searched(self, frame: np.ndarray) -> Loads:
+    def searched(self, frame: np.ndarray, taught: bool = False) -> Loads:
         """Loads by a search."""
-        return self.fitter(frame, self.finder(frame))
+        return self.fits(taught)(frame, self.finder(frame))
 
-    def refined(self, frame: np.ndarray) -> Loads:
+    def refined(self, frame: np.ndarray, taught: bool = False) -> Loads:
         """Loads by the network and fits from where it proposes."""
-        return self.fitter.refine(frame, self.proposal(frame), self.finder(frame))
+        return self.fits(taught).refine(frame, self.proposal(frame), self.finder(frame))
+
+    def fits(self, taught: bool) -> LoadFitter:
+        """The fits of loads, as presses have taught them or as usual."""
+        return self.taught if taught else self.fitter
 
 
 def ways(run: Run) -> Iterator[Row]:
@@ -95,19 +107,39 @@ def ways(run: Run) -> Iterator[Row]:
             for touch, frame, ready in noisy_frames(name, seed, singles, others):
                 every += [{"way": way} | judged(touch, answer) for way, answer in _answers(frame, ready)]
             print(f"{name} {seed}", flush=True)
-        yield {"rows": [{"skin": name} | row for row in _means(every)], "ways_reliability": _stated(name, every)}
+        of_skin = {"rows": _means(every), "ways_means": _whole(every)}
+        yield {part: [{"skin": name} | row for row in rows] for part, rows in of_skin.items()} | {
+            "ways_reliability": _stated(name, every)
+        }
 
 
-def noisy_frames(name: str, seed: int, singles: int, others: int) -> Iterator[tuple[Touch, np.ndarray, Ready]]:
-    """Touches of `NAMES` on the skin of a seed, with a noisy frame each."""
+def noisy_frames(
+    name: str, seed: int, singles: int, others: int, presses: int = PRESSES
+) -> Iterator[tuple[Touch, np.ndarray, Ready]]:
+    """Touches of `NAMES` on the skin of a seed, with a noisy frame each, and what tells them after some presses."""
     rng = np.random.default_rng(seed)
     given = [touch for touch in touched(name, rng, singles, others) if touch.name in NAMES]
-    found, model = recorded(name, seed, given), fit_model(name)
-    noise, sheet = found.std, je.fit_background(model, found.blank(rng))
-    fitter = je.contacts.prepare_loads(model, noise=noise, sigma=sheet)
-    ready = Ready(je.contacts.load_proposal(name), fitter, je.prepare_contacts(model, noise=noise, sigma=sheet))
-    for touch, change in zip(given, found.change, strict=True):
-        yield touch, change + found.noise * rng.normal(size=change.size), ready
+    own = np.random.default_rng([seed, 1])
+    lessons, model = teaching(name, presses, own), fit_model(name)
+    both = pressed(seed, [*tips(given), *lessons], Wear(), name)
+    known = {"noise": both.std, "sigma": je.fit_background(model, both.blank(rng))}
+    noisy = both.change[len(given) :] + both.noise * own.normal(size=(presses, both.change.shape[1]))
+    fitter = taught = je.contacts.prepare_loads(model, **known)
+    if presses:
+        truth = (np.concatenate([getattr(one, name) for one in lessons]) for name in ("places", "forces"))
+        learned = je.contacts.learn_loads(model, noisy, *truth, **known)
+        print(learned.changed(), flush=True)
+        taught = je.contacts.prepare_loads(model, learned, **known)
+    ready = Ready(je.contacts.load_proposal(name), fitter, taught, je.prepare_contacts(model, **known))
+    for touch, change in zip(given, both.change, strict=False):
+        yield touch, change + both.noise * rng.normal(size=change.size), ready
+
+
+def teaching(name: str, count: int, rng: np.random.Generator) -> list[Press]:
+    """Presses on a skin of a name, whose places and forces are known."""
+    places = described(name).size * rng.uniform(MARGIN, 1 - MARGIN, (count, 1, 2))
+    each = zip(places, rng.uniform(*FORCES, (count, 1)), strict=True)
+    return [Press(place, force, PRESS_TIP) for place, force in each]
 
 
 def _answers(frame: np.ndarray, ready: Ready) -> Iterator[tuple[str, Answer]]:
@@ -115,6 +147,8 @@ def _answers(frame: np.ndarray, ready: Ready) -> Iterator[tuple[str, Answer]]:
     yield FITS, _fitted(ready.searched(frame))
     yield NETWORK, Answer(proposed.probability, lambda kind: proposed.of(kind)[:, :2])
     yield BOTH, _fitted(ready.refined(frame))
+    yield TAUGHT, _fitted(ready.searched(frame, taught=True))
+    yield BOTH_TAUGHT, _fitted(ready.refined(frame, taught=True))
 
 
 def _fitted(found: Loads) -> Answer:
@@ -130,7 +164,9 @@ def times(run: Run) -> Iterator[Row]:
     (singles, others), rows = run.sizes((6, 2), (1, 1)), []
     for touch, frame, ready in noisy_frames("testbed", FIRST_SEED - 1, singles, others):
         ready.refined(frame)  # what is compiled is compiled
-        for way, tell in ((FITS, ready.searched), (NETWORK, ready.proposal), (BOTH, ready.refined)):
+        ways = {FITS: ready.searched, NETWORK: ready.proposal, BOTH: ready.refined}
+        ways |= {TAUGHT: partial(ready.searched, taught=True), BOTH_TAUGHT: partial(ready.refined, taught=True)}
+        for way, tell in ways.items():
             spent, _ = seconds(lambda tell=tell, frame=frame: jax.block_until_ready(tell(frame)))
             rows.append({"touch": touch.name, "way": way, "ms": 1e3 * spent})
     middle = {way: np.median([row["ms"] for row in mine]) for way, mine in grouped(rows, "way").items()}
@@ -169,6 +205,15 @@ def _means(every: list[Row]) -> Iterator[Row]:
             means = {key: float(np.mean([row[key] for row in mine])) for key in ("told", "several", "surprise")}
             means["error_mm"] = float(np.median([row["error_mm"] for row in mine]))
             yield {"touch": name, "way": way, "frames": len(mine)} | rounded(means)
+
+
+def _whole(every: list[Row]) -> Iterator[Row]:
+    """Means over all touches, and how many single tips were called several."""
+    for way, mine in grouped(every, "way").items():
+        means = {key: float(np.mean([row[key] for row in mine])) for key in ("told", "surprise")}
+        means["false_several"] = float(np.mean([row["several"] for row in mine if row["name"] == NAMES[0]]))
+        means["error_mm"] = float(np.median([row["error_mm"] for row in mine]))
+        yield {"way": way, "frames": len(mine)} | rounded(means)
 
 
 def stated(run: Run) -> Iterator[Row]:

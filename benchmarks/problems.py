@@ -188,12 +188,14 @@ def pressed(
     edge_length: float = 0.026,
     spread: float = 0.012,
     skin: str | je.Skin = "testbed",
+    law: tuple[float, float, float] = (1.0, 20e3, 1.0),
 ) -> Pressed:
     """A skin pressed by tips of 20 mm at (presses, k, 2) m at once with (presses, k) N, on a mesh of its own.
 
-    The pad spreads each tip to a Gaussian of standard deviation ``spread``, m.
+    The pad spreads each tip to a Gaussian of standard deviation ``spread``, m; ``law`` holds amplitude, half pressure
+    (Pa) and exponent of `ContactPiezoresistance`.
     """
-    effects = (je.effects.LoadSpreading(spread), *effects, je.effects.ContactPiezoresistance(1.0, 20e3, 1.0))
+    effects = (je.effects.LoadSpreading(spread), *effects, je.effects.ContactPiezoresistance(*law))
     scene = je.Scene(je.load_skin(skin) if isinstance(skin, str) else skin, effects)
     model = je.discretise(scene, je.Fidelity.standard(edge_length=edge_length))
     untouched = np.asarray(je.forward(model))

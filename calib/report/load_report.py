@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxeit.contacts import LoadKind
 
-from ..calibration.localisation.load_windows import left_by_fits
+from ..calibration.localisation.load_windows import LEARNED, left_by_fits
 from .figures.force_series import SERIES
 from .figures.panels import WIDER, Panel, chart_axes, panel
 from .figures.parts import MM
@@ -69,7 +69,9 @@ def panel_of_kinds(windows: Windows, *, simulated: bool) -> Panel:
 
 def _notes(windows: Windows) -> list[str]:
     left = left_by_fits(windows["misfit"]) if "misfit" in windows else ""  # a file of an early version has none
-    return [*_of_network(windows), *([f"<p>Of these windows, {escape(left)}.</p>"] if left else [])]
+    learned = [f"Presses of the calibration told the fits that {line}" for line in windows.get(LEARNED, ())]
+    said = [*([f"Of these windows, {left}"] if left else []), *learned]
+    return [*_of_network(windows), *(f"<p>{escape(line)}.</p>" for line in said)]
 
 
 def _of_network(windows: Windows) -> list[str]:

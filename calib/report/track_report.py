@@ -47,7 +47,8 @@ def write_track_report(path: str | Path, forces: str | Path, skin: je.Skin) -> P
     with open_archive(forces, FORMAT) as archive:
         attrs, known = archive.attrs, archive.arrays
         rows = {name: known[TRACKS + name].read() for name in ABOUT if TRACKS + name in known}
-        loads = {name: known[LOADS + name].read() for name in load_windows.ABOUT if LOADS + name in known}
+        names = (*load_windows.ABOUT, load_windows.LEARNED)
+        loads = {name: known[LOADS + name].read() for name in names if LOADS + name in known}
     text = _page(rows, loads, attrs, skin)
     with replacing(page) as temporary:
         temporary.write_bytes(text.encode())

@@ -1,8 +1,7 @@
 """How far the model of a skin errs, from frames in which one contact presses."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,19 +10,13 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from .._compile import require_known
+from ..contacts.loads.model_error import fitted_model_error
 from ..imaging.noise import InverseError
 from .belief.filter import Pads
 from .belief.layer import LearnedLayer
 from .looks import has_ended
 from .preparation import MESH_GAIN
 from .tracker import Tracker
-
-# Model errors that are tried: each is larger than the one before by this factor, up to the last.
-STEP, LAST = 2**0.5, 0.15
-# Share of the presses whose model error is no larger than that of the tracker.
-SHARE = 0.9
-# Numbers of frames that an error names.
-SHOWN = 10
 
 
 def fit_model_error(
@@ -36,9 +29,8 @@ def fit_model_error(
 
     Mesh, contact layer and loads of a real skin are not those of the model. A tracker that takes the model for better
     than it is explains what the model leaves of a press by further contacts. Here one contact is fitted to each frame
-    under each of some model errors, from that of the settings on, until the evidence of the frame falls (empirical
-    Bayes; MacKay 1992, Neural Computation 4, 415). Frames for which no such fit converges are left out. Presses differ:
-    near an electrode a model may err ten times as much as elsewhere, and the tracker must not err there either.
+    under each of some model errors, from that of the settings on (`jaxeit.contacts.loads.model_error`). Frames for
+    which no such fit converges are left out.
 
     Args:
         dv: difference frames, (n, readings) V, in each of which one contact presses, as means over holds.
@@ -55,18 +47,12 @@ def fit_model_error(
     """
     require_known("fit_model_error", InverseError, dv, pad_forces, pad_errors)
     seen = _seen(tracker, dv, pad_forces, pad_errors)
-    least = tracker.settings.loads.model_error
-    last = max(0, int(np.ceil(np.log(LAST / least) / np.log(STEP))))
-    tried = cache(lambda k: _with_model_error(tracker, least * STEP**k))  # most presses ask for the first few
-    found = [_most_probable(tried, last, *one) for one in seen]
-    fitted = [k for k in found if k is not None]
-    if 2 * len(fitted) <= len(found):
-        failed = [number for number, k in enumerate(found) if k is None]
-        raise InverseError(
-            f"one contact is fitted to {len(fitted)} of {len(found)} frames, and its fit does not converge for frames "
-            f"{failed[:SHOWN]}; give frames in each of which one contact presses and rests"
-        )
-    return tried(int(np.quantile(fitted, SHARE, method="higher")))
+    tried = cache(partial(_with_model_error, tracker))  # most presses ask for the first few
+
+    def evidence(frame: np.ndarray, pads: Pads, error: float) -> float:
+        return _evidence(tried(error), frame, pads)
+
+    return tried(fitted_model_error([partial(evidence, *one) for one in seen], tracker.settings.loads.model_error))
 
 
 def press_evidence(
@@ -101,23 +87,6 @@ def _seen(
         (tracker.frame(frame), tracker.pads(force, error))
         for frame, force, error in zip(frames, forces, errors, strict=True)
     ]
-
-
-def _most_probable(
-    tried: Callable[[int], Tracker], last: int, frame: Float[np.ndarray, " readings"], pads: Pads
-) -> int | None:
-    """Which of the trackers 0 to ``last`` makes a frame most probable; the evidence falls from there on.
-
-    None if no fit converges.
-    """
-    best, most = None, -np.inf
-    for k in range(last + 1):
-        evidence = _evidence(tried(k), frame, pads)
-        if evidence < most:
-            break
-        if evidence > most:
-            best, most = k, evidence
-    return best
 
 
 def _with_model_error(tracker: Tracker, error: float) -> Tracker:

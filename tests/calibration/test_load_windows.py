@@ -11,8 +11,10 @@ import calib
 import jaxeit as je
 from calib.bench import load_bench, simulate
 from calib.calibration.localisation import load_windows
+from calib.calibration.localisation.learned_loads import FEWEST, MOST, learned_loads, render_loads
 from calib.calibration.localisation.load_windows import WindowedFrames
 from calib.calibration.localisation.proposals import chosen_proposal
+from calib.calibration.press_examples import PressExamples
 from calib.cli import main
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import GainField, LearnedLayer
@@ -43,23 +45,93 @@ class Asked(Exception):
     """The fit of loads is prepared."""
 
 
-def test_loads_are_fitted_with_the_layer_that_the_calibration_learned(calibration, monkeypatch):
-    corners, readings = np.array([[0.0, 0.0], [0.2, 0.2]]), calibration.recon.readings
-    layer = LearnedLayer.unknown(GainField.over(corners, corners, je.contacts.LoadSettings(gain_length=0.05), 0.3))
+@pytest.fixture
+def asked(calibration, monkeypatch):
+    """What loads are fitted with: gain of the layer and settings, for a calibration and settings of the user."""
 
-    def prepare(*_, gain, **__):
-        raise Asked(gain)
+    def prepare(_, settings, *, gain, **__):
+        raise Asked(gain, settings)
 
     monkeypatch.setattr(je.contacts, "prepare_loads", prepare)
     monkeypatch.setattr(load_windows, "fit_untouched_sheet", lambda *_: (None, ()))
+    readings = calibration.recon.readings
     seen, noise = WindowedFrames(0.1, readings), np.random.default_rng(0).normal(size=(60, readings))
     loaded = np.arange(60) >= 40
     seen.add(np.arange(60) * S // 100, noise, noise, loaded, np.where(loaded, 9.0, 0.0))
     seen.close()
+
+    def of(one, settings=None):
+        with pytest.raises(Asked) as found:
+            load_windows.fit_windows(one, seen, settings=settings)
+        return found.value.args
+
+    return of
+
+
+def test_loads_are_fitted_with_the_layer_that_the_calibration_learned(calibration, asked):
+    corners = np.array([[0.0, 0.0], [0.2, 0.2]])
+    layer = LearnedLayer.unknown(GainField.over(corners, corners, je.contacts.LoadSettings(gain_length=0.05), 0.3))
     for known in (layer, None):
-        with pytest.raises(Asked) as asked:
-            load_windows.fit_windows(replace(calibration, layer=known), seen)
-        assert asked.value.args[0] is known
+        assert asked(replace(calibration, layer=known, probes=None)) == (known, None)
+
+
+def test_loads_are_fitted_as_the_presses_of_the_calibration_tell(calibration, asked, monkeypatch):
+    """Unless the user says what is known of loads."""
+    told, own = je.contacts.LoadSettings(texture=0.1), je.contacts.LoadSettings.round_tips()
+    monkeypatch.setattr(load_windows, "learned_loads", lambda *_: told)
+    assert asked(calibration)[1] is told
+    assert asked(calibration, own)[1] is own
+
+
+def presses(count, readings, pads):
+    rng = np.random.default_rng(1)
+    dv, pressure = rng.normal(size=(count, readings)), np.full((count, pads), 500.0)
+    return PressExamples(dv, pressure, rng.uniform(0, 0.2, (count, 2)), rng.uniform(5, 20, count))
+
+
+def test_whole_presses_of_a_calibration_tell_loads(calibration, model, monkeypatch):
+    readings, given = calibration.recon.readings, []
+    probes = presses(MOST + 4, readings, 4)
+    channels = np.arange(readings) != 5
+    probes.dv[0, 5] = np.nan  # of a reading that is not used
+    probes.dv[2, 7] = np.nan
+
+    def learn(_, dv, position, force, *, gain, **sheet):
+        given.append((dv, position, force, gain))
+        assert sheet.keys() == {"noise", "channels"}
+        return je.contacts.LoadSettings(texture=0.1)
+
+    monkeypatch.setattr(je.contacts, "learn_loads", learn)
+    known = {"noise": np.ones(readings), "channels": channels}
+    found = learned_loads(replace(calibration, probes=probes), model, known)
+    assert found.texture == 0.1
+    (dv, position, force, gain), whole = given[0], [0, 1, *range(3, MOST + 1)]
+    np.testing.assert_array_equal(position, probes.position[whole])
+    np.testing.assert_array_equal(force, probes.force[whole])
+    assert dv.shape == (MOST, readings)
+    assert gain is calibration.layer
+    few = replace(calibration, probes=presses(FEWEST - 1, readings, 4))
+    assert learned_loads(few, model, known) is None
+    assert learned_loads(replace(calibration, probes=None), model, known) is None
+    assert len(given) == 1
+
+
+def test_presses_whose_fits_do_not_converge_tell_nothing(calibration, model, monkeypatch):
+    def learn(*_, **__):
+        raise InverseError("no fit converges")
+
+    monkeypatch.setattr(je.contacts, "learn_loads", learn)
+    readings = calibration.recon.readings
+    probes = replace(calibration, probes=presses(FEWEST, readings, 4))
+    assert learned_loads(probes, model, {"channels": np.ones(readings, bool)}) is None
+
+
+def test_what_was_learned_is_told_in_one_line():
+    learned = je.contacts.LoadSettings(law=je.effects.ContactPiezoresistance(1.5, 25e3, 1.1), texture=0.2)
+    assert render_loads(learned) == (
+        "pressure adds up to 150 % of conductivity, half of that at 25 kPa (exponent 1.10); texture 0.20, "
+        "model error 0.5 %"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +178,9 @@ def test_two_contacts_are_told_over_time(session, tmp_path, capsys):
     assert (of_round["loads/probability"][both, 2] > 0.9).all()
     assert not of_round["loads/probability"][:, 3].any()
     assert main([*searching[:-2], "--report", str(tmp_path / "r.html")]) == 0  # the shipped network, by default
-    assert "What touched the skin" in (tmp_path / "r.html").read_text()
+    page = (tmp_path / "r.html").read_text()
+    assert "What touched the skin" in page
+    assert "Presses of the calibration told the fits that pressure adds up to" in page
     proposed = calib.session.read_archive(out, "skin-forcemap").arrays
     assert (proposed["loads/distance"] < 1).all()
     told = both & (proposed["loads/probability"].argmax(1) == 2)

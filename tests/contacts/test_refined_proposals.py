@@ -11,7 +11,7 @@ from benchmarks.bench_proposal import SHIPPED, counted, noisy_frames
 def test_a_refined_proposal_is_no_worse_than_a_search(name):
     """It is less surprised by the true kinds, and loads of the kind that it tells explain the frames as well."""
     surprises, misfits = [], []
-    for touch, frame, ready in noisy_frames(name, 7320, 2, 1):
+    for touch, frame, ready in noisy_frames(name, 7320, 2, 1, presses=0):
         both = searched, refined = ready.searched(frame), ready.refined(frame)
         surprises.append([-np.log(max(float(found.probability[counted(touch)]), 1e-6)) for found in both])
         misfits.append([float(found.of(refined.kind).misfit) for found in both])

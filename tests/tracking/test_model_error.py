@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from jaxeit.contacts.loads.model_error import STEP
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import fit_model_error, model_error, press_evidence
 from jaxeit.tracking.belief.filter import SIZE
 from jaxeit.tracking.belief.programs import Programs
-from jaxeit.tracking.model_error import STEP
 from jaxeit.tracking.preparation import MESH_GAIN
 
 from .conftest import SECONDS, load

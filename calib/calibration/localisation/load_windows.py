@@ -17,6 +17,7 @@ from jaxeit.contacts import LoadKind, Loads, LoadSettings, Proposal
 
 from ...presses.streams import finite_mean
 from ..calibration import Calibration
+from .learned_loads import learned_loads, render_loads
 from .press_images import fit_untouched_sheet
 from .quiet_frames import QuietFrames
 
@@ -26,6 +27,7 @@ MOST = 3  # loads of a window
 # Chi-square over the number of readings of a fit, and part of the windows beyond it from which it is worth a line. On
 # honest skins of another simulator the median reaches 2; where bolts are 2 mm aside it begins at 25.
 SURPRISING, MIN_SURPRISING = 6.0, 0.5
+LEARNED = "learned"  # array with a line about what was learned of loads
 MAX_WINDOW_FRAMES = 4096  # of a window, so that memory stays bounded
 
 
@@ -87,6 +89,7 @@ class SeenLoads:
     why_none: str = ""
     outside: int = 0  # windows that are unlike the scenes of the proposal
     left: str = ""  # what their fits leave, if that is more than is believed
+    learned: str = ""  # what presses of the calibration told of loads, in words
 
     def render(self) -> str:
         """What touched the skin, in one line."""
@@ -94,7 +97,8 @@ class SeenLoads:
             return f"loads: none fitted: {self.why_none}"
         seen = ", ".join(self._told(kind) for kind in LoadKind if kind in self.kinds)
         unlike = f"; {self.outside} are unlike what the proposal was trained on" if self.outside else ""
-        return f"loads of {len(self.kinds)} windows: {seen}{unlike}" + (f"; {self.left}" if self.left else "")
+        left, learned = f"; {self.left}" if self.left else "", f"; learned: {self.learned}" if self.learned else ""
+        return f"loads of {len(self.kinds)} windows: {seen}{unlike}{left}{learned}"
 
     def _told(self, kind: LoadKind) -> str:
         """How many windows are of a kind, and its mean probability there."""
@@ -109,7 +113,11 @@ def fit_windows(
     proposal: Proposal | None = None,
     settings: LoadSettings | None = None,
 ) -> SeenLoads:
-    """Fit loads to each window, from what a finder sees or from a proposal; ``settings`` as for `prepare_loads`."""
+    """Fit loads to each window, from what a finder sees or from a proposal.
+
+    Args:
+        settings: as for `prepare_loads`; None: what the presses of the calibration tell (`learned_loads`).
+    """
     noise = seen.quiet.noise
     if noise is None or not seen.windows:
         why = "no frames without contact tell the noise" if noise is None else "nothing touches the skin for that long"
@@ -120,14 +128,18 @@ def fit_windows(
     sheet, _ = fit_untouched_sheet(model, seen.quiet.untouched, channels)
     of_means = np.where(channels, noise, 1.0) / np.sqrt(np.median([window.frames for window in seen.windows]))
     known = {"noise": of_means, "sigma": sheet, "channels": channels}
-    fitter = je.contacts.prepare_loads(model, settings, gain=calibration.layer, **known)
+    learned = learned_loads(calibration, model, known) if settings is None else None
+    fitter = je.contacts.prepare_loads(model, settings or learned, gain=calibration.layer, **known)
     finder = je.prepare_contacts(model, **known)
     found = [_found(fitter, finder, proposal, window, channels) for window in progress(seen.windows)]
     loads, distance = zip(*found, strict=True)
     outside = int(np.sum(np.array(distance) > 1))
     kinds, stated = zip(*((one.kind, float(np.max(one.probability))) for one in loads), strict=True)
     arrays = _arrays(seen.windows, found)
-    return SeenLoads(arrays, kinds, stated, outside=outside, left=left_by_fits(arrays["misfit"][0]))
+    told = "" if learned is None else render_loads(learned)
+    if told:
+        arrays[LEARNED] = (np.array([told]), "1", "what presses of the calibration told of loads")
+    return SeenLoads(arrays, kinds, stated, outside=outside, left=left_by_fits(arrays["misfit"][0]), learned=told)
 
 
 def left_by_fits(misfit: np.ndarray) -> str:

@@ -1,6 +1,7 @@
 """What touches the skin in one frame: loads fitted through the pressure law."""
 
 from .fitter import LoadFitter
+from .learning import learn_loads
 from .preparation import prepare_loads
 from .proposal import Proposal, Proposed, load_proposal, shipped_proposal
 from .result import LoadKind, Loads, LoadShape
@@ -14,6 +15,7 @@ __all__ = [
     "Loads",
     "Proposal",
     "Proposed",
+    "learn_loads",
     "load_proposal",
     "prepare_loads",
     "shipped_proposal",

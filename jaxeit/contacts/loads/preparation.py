@@ -103,7 +103,10 @@ def _sheet(
     if known is not None:
         mean, gain, covariance = known.over(centroids)
         about = KnownGain(put(np.exp(mean)), put(covariance))
-    modes = coat * field_modes(centroids, settings.coat_length) if coat else np.zeros((len(centroids), 0))
+    texture, modes = (
+        spread * field_modes(centroids, length) if spread else np.zeros((len(centroids), 0))
+        for spread, length in ((settings.texture, settings.texture_length), (coat, settings.coat_length))
+    )
     sheet = PressedSheet(
         model=model,
         sigma=sigma,
@@ -113,6 +116,7 @@ def _sheet(
         points=put(points),
         weights=put(weights),
         gain=put(gain),
+        texture=put(texture),
         coat=put(modes),
         by_coat=put(np.zeros((len(factor), modes.shape[1]))),
         shape=put(settings.shape),

@@ -10,7 +10,7 @@ from ...imaging.noise import InverseError
 
 KNOWN_COAT, UNKNOWN_COAT = 0.0, 0.15
 POSITIVE = (
-    *("gain_length", "coat_length", "width", "width_spread", "force", "force_spread"),
+    *("gain_length", "texture_length", "coat_length", "width", "width_spread", "force", "force_spread"),
     *("width_difference", "force_difference", "length", "nearest", "shortest"),
 )
 NO_EDGE = (0.25, 0.25, 0.25, 0.0, 0.25)
@@ -25,6 +25,9 @@ class LoadSettings:
     | law: factor of conductivity by pressure                                      | Hill, 20 kPa |      |
     | gain: standard deviation of the log gain of the contact layer                | 0.12         | 1    |
     | gain_length: over which it changes                                           | 0.015        | m    |
+    | texture: standard deviation of the log gain of protrusions and of what loads | 0            | 1    |
+    |   are unlike the fit's in, which no number of presses teaches (`learn_loads`) |              |      |
+    | texture_length: over which it changes                                        | 0.0075       | m    |
     | coat: standard deviation of the log conductivity that the sheet is not known | see below    | 1    |
     |   by; None: 0 for a sheet given or fitted to a frame, 0.15 for an even one    |              |      |
     | coat_length: over which it changes                                           | 0.03         | m    |
@@ -55,6 +58,8 @@ class LoadSettings:
     law: ContactPiezoresistance = field(default_factory=ContactPiezoresistance)
     gain: float = 0.12
     gain_length: float = 0.015
+    texture: float = 0.0
+    texture_length: float = 0.0075
     coat: float | None = None
     coat_length: float = 0.03
     shape: float = 0.1
@@ -75,7 +80,7 @@ class LoadSettings:
         for name in POSITIVE:
             if not 0 < getattr(self, name) < np.inf:
                 raise InverseError(f"{name} is {getattr(self, name)}; give a number above zero")
-        for name in ("gain", "coat", "shape", "model_error"):
+        for name in ("gain", "texture", "coat", "shape", "model_error"):
             if getattr(self, name) is not None and not 0 <= getattr(self, name) < np.inf:
                 raise InverseError(f"{name} is {getattr(self, name)}; give 0 or more")
         if not (len(self.shapes) and min(self.shapes) >= 0 and max(self.shapes) < np.inf):

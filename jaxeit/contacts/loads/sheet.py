@@ -20,7 +20,7 @@ from ...model.forward_model import coefficients, fields, series_resistance, tran
 from ...model.sensitivity import element_slopes
 from .pressure import Forms, Parameters, elongations, pressure, shape_directions, tilt_directions
 
-MODES = 72  # of the gain that loads reach, of those on the whole sheet
+MODES = 72  # of the gain that loads reach, of those on the whole sheet; and as many of its texture
 
 
 class Linearised(NamedTuple):
@@ -48,6 +48,7 @@ class Unknowns(NamedTuple):
     | tilts: further moments of shapes, which are not                                   | (r, t)   |
     | loads: all parameters of all loads                                                | (r, 6 k) |
     | elongation: second moments of the first load                                      | (r, 2)   |
+    | law: logs of the parameters of the law of pressure                                | (r, 3)   |
     """
 
     value: Float[Array, " r"]
@@ -56,6 +57,7 @@ class Unknowns(NamedTuple):
     tilts: Float[Array, "r t"]
     loads: Float[Array, "r m"]
     elongation: Float[Array, "r 2"]
+    law: Float[Array, "r 3"]
 
 
 class KnownGain(eqx.Module):
@@ -81,6 +83,7 @@ class PressedSheet(eqx.Module):
     | untouched: whitened readings without loads                            | (r,)             |       |
     | points of the elements, their weights                                 | (elements, q, 2), (q,) | m |
     | gain: modes of the log gain of the contact layer, at centroids        | (elements, g)    | 1     |
+    | texture: further modes of that gain, which are never learned          | (elements, t)    | 1     |
     | coat: modes of the log conductivity that is not known                 | (elements, c)    | 1     |
     | by_coat: slopes of the whitened readings in these without loads       | (r, c)           |       |
     | shape: standard deviation of the moments of a load's shape            | ()               | 1     |
@@ -96,6 +99,7 @@ class PressedSheet(eqx.Module):
     points: Float[Array, "elements q 2"]
     weights: Float[Array, " q"]
     gain: Float[Array, "elements g"]
+    texture: Float[Array, "elements t"]
     coat: Float[Array, "elements c"]
     by_coat: Float[Array, "r c"]
     shape: Float[Array, ""]
@@ -132,20 +136,21 @@ class PressedSheet(eqx.Module):
         slope = jax.jvp(self.law.factor, (here,), (jnp.ones_like(here),))[1]
         by_pressure = self.sigma[at.near, None] * slope * self.weights
         by_gain, by_pressure = jnp.sum(by_pressure * here, 1), by_pressure * factor
-        there = jax.lax.top_k(by_gain @ self.gain[at.near], min(MODES, self.gain.shape[1]))[1]
-        gain = by_gain[:, None] * self.gain[at.near[:, None], there]
+        gain, there = _reached(by_gain, self.gain[at.near])
         if self.known is not None:
             gain = gain @ lapack.cholesky(self.known.covariance[jnp.ix_(there, there)], lower=True)
+        gain = jnp.concatenate([gain, _reached(by_gain, self.texture[at.near])[0]], 1)
         shapes, tilts = shape_directions(loads, forms, points), tilt_directions(loads, forms, points)
         bent = jnp.concatenate([self.shape * shapes, self.shape * tilts, elongations(loads[0], points)], -1)
-        mixed = self._mixed(at, jnp.concatenate([gain, jnp.einsum("eq,eqd->ed", by_pressure, bent)], 1))
-        ends = np.cumsum([gain.shape[1], shapes.shape[-1], tilts.shape[-1]])
-        _, by_shapes, by_tilts, elongation = jnp.split(mixed, ends, 1)
+        by_shape = jnp.einsum("eq,eqd->ed", by_pressure, bent)
+        mixed = self._mixed(at, jnp.concatenate([gain, by_shape, self._by_law(at.near, here)], 1))
+        ends = np.cumsum([gain.shape[1], shapes.shape[-1], tilts.shape[-1], 2])
+        _, by_shapes, by_tilts, elongation, by_law = jnp.split(mixed, ends, 1)
         nuisances = mixed[:, : ends[1]]
         if self.coat.shape[1]:
             by_coat = self.coat_slopes(self._pressed(loads, forms)) - self.by_coat
             nuisances = jnp.concatenate([nuisances, by_coat], 1)
-        return Unknowns(at.value, nuisances, by_shapes, by_tilts, self.slopes(at, loads, forms), elongation)
+        return Unknowns(at.value, nuisances, by_shapes, by_tilts, self.slopes(at, loads, forms), elongation, by_law)
 
     def coat_slopes(self, sigma: Float[Array, " elements"]) -> Float[Array, "r c"]:
         """Slopes of the readings of a sheet in its log conductivity."""
@@ -177,6 +182,12 @@ class PressedSheet(eqx.Module):
         near: Int[Array, " e"] = jax.lax.top_k(jnp.max(by_force / most, 1), self.reach)[1]
         return near
 
+    def _by_law(self, near: Int[Array, " e"], pressure: Float[Array, "e q"]) -> Float[Array, "e 3"]:
+        """Slopes of the conductivity of elements in the logs of the parameters of the law."""
+        slopes = jax.jacfwd(lambda logs: scaled_law(self.law, logs).factor(pressure) @ self.weights)
+        found: Array = self.sigma[near, None] * slopes(jnp.zeros(3, self.sigma.dtype))
+        return found
+
     def _factor(self, elements: Int[Array, " e"] | slice) -> Float[Array, "e 1"] | float:
         """Factor of the pressure on elements: the mean gain, where it is known."""
         return 1.0 if self.known is None else self.known.factor[elements, None]
@@ -184,3 +195,18 @@ class PressedSheet(eqx.Module):
     def _mixed(self, at: Linearised, change: Float[Array, "e d"]) -> Float[Array, "r d"]:
         """What a change of the conductivity near the loads does to the readings."""
         return self.factor @ (at.by_element.T @ change)
+
+
+def _reached(by_gain: Float[Array, " e"], modes: Float[Array, "e g"]) -> tuple[Float[Array, "e m"], Int[Array, " m"]]:
+    """Changes of the conductivity by the modes that change it most, and which ones these are."""
+    there: Int[Array, " m"] = jax.lax.top_k(by_gain @ modes, min(MODES, modes.shape[1]))[1]
+    return by_gain[:, None] * modes[:, there], there
+
+
+def scaled_law(law: ContactPiezoresistance, logs: Float[Array, "3"]) -> ContactPiezoresistance:
+    """A law whose amplitude, half pressure and exponent are those of another times exp of these logs."""
+    parts, structure = jax.tree.flatten(law)
+    scaled: ContactPiezoresistance = jax.tree.unflatten(
+        structure, [part * jnp.exp(log) for part, log in zip(parts, logs, strict=True)]
+    )
+    return scaled

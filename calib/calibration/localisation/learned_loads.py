@@ -1,0 +1,43 @@
+"""What the presses that a calibration kept tell of loads: law of pressure, texture of the gain, error of the model."""
+
+from typing import Any
+
+import numpy as np
+
+import jaxeit as je
+from jaxeit.contacts import LoadSettings
+
+from ..calibration import Calibration
+
+FEWEST, MOST = 12, 16  # presses from which loads are learned; more take longer and hardly tell more
+
+
+def learned_loads(calibration: Calibration, model: je.Model, known: dict[str, Any]) -> LoadSettings | None:
+    """Settings of loads by the presses that the calibration kept (`jaxeit.contacts.learn_loads`).
+
+    None where it kept too few that are whole, as one of an early version, or where fits of them do not converge.
+
+    Args:
+        known: noise, sigma and channels of the frames whose loads are to be fitted.
+    """
+    probes = calibration.probes
+    if probes is None:
+        return None
+    whole = np.flatnonzero(np.isfinite(probes.dv[:, known["channels"]]).all(1))[:MOST]  # each far from those before it
+    if len(whole) < FEWEST:
+        return None
+    frames, places, forces = probes.dv[whole], probes.position[whole], probes.force[whole]
+    try:
+        return je.contacts.learn_loads(model, frames, places, forces, gain=calibration.layer, **known)
+    except je.imaging.InverseError:
+        return None
+
+
+def render_loads(loads: LoadSettings) -> str:
+    """What was learned of loads, in one line."""
+    law = loads.law
+    return (
+        f"pressure adds up to {100 * float(law.amplitude):.0f} % of conductivity, half of that at "
+        f"{1e-3 * float(law.half_pressure):.0f} kPa (exponent {float(law.exponent):.2f}); texture {loads.texture:.2f}, "
+        f"model error {100 * loads.model_error:.1f} %"
+    )

@@ -1,0 +1,221 @@
+"""What presses of known place and force tell of loads: the law of pressure, the texture of the gain, the model's error.
+
+A frame tells the force and the shape of a load through the law that turns pressure into conductivity. Under a law that
+saturates too early a strong press is fitted as a far stronger one, too narrow and in another place, and what is left of
+the frame is explained by further loads. So one load p_i is fitted to each press, whose force is known, and the
+parameters theta of the law, which all presses share, by Gauss-Newton steps of
+
+    |log theta|^2_S + sum_i min over p_i (|y_i - h(p_i, theta)|^2_R + |u(p_i)|^2 + log det R)  ->  min over theta,
+
+where R is the covariance of what a fit errs by, gain and shape of the load among it, u what is unusual of a load, and S
+what is known of laws before. The loads are eliminated from each step (Golub and Pereyra 1973, SIAM J. Numer. Anal. 10,
+413). A press that fits far worse than most, as one whose frame is not its own, is left out.
+
+What the law leaves has two parts. Protrusions, and loads that are not Gaussians, are like a gain that changes over a
+few millimetres: its standard deviation, the texture, is the one under which all presses together are most probable.
+What is left even so is the model error (`fitted_model_error`).
+"""
+
+import math
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float
+from scipy.linalg import solve_triangular
+
+from ..._compile import require_known
+from ...effects.material import ContactPiezoresistance
+from ...imaging.noise import InverseError
+from ...model.discretisation import Model
+from .comparison import LAST_FALL, Comparison, Fit, improbability, padded
+from .fitter import LoadFitter
+from .model_error import fitted_model_error
+from .preparation import prepare_loads
+from .programs import Problem, before
+from .result import LoadKind
+from .settings import LoadSettings
+
+# Standard deviations of the logs of amplitude, half pressure and exponent before any press. Amplitude and half pressure
+# of a layer are hardly known; with larger exponents fits of weak or long loads seldom find their end.
+SPREAD = np.array([0.7, 1.0, 0.05])
+# Standard deviations of the gain's texture that are tried, until presses are less probable.
+TEXTURES = (0.0, 0.1, 0.2)
+# Standard deviation of the log of a force that a load cell tells.
+FORCE_ERROR = 0.03
+# Presses that tell loads, at least.
+FEWEST = 6
+# Steps of the law under each texture; how often one is halved; largest change of a log in a step, and the one below
+# which steps end.
+STEPS, HALVINGS, MOST_STEP, LEAST_STEP = 4, 2, 0.7, 0.03
+# Chi-square of a press over the median, beyond which it is left out.
+UNUSUAL = 5.0
+
+
+def learn_loads(
+    model: Model,
+    dv: Float[ArrayLike, "n readings"],
+    position: Float[ArrayLike, "n 2"],
+    force: Float[ArrayLike, " n"],
+    settings: LoadSettings | None = None,
+    **sheet: Any,
+) -> LoadSettings:
+    """Settings of loads by presses of known place and force, for `prepare_loads` and for a tracker.
+
+    The law of pressure, the texture of the gain and the model error are learned; the other settings stay. Give presses
+    of several forces all over the sheet: one force alone tells one number of the law.
+
+    Args:
+        dv: difference frames, (n, readings) V, in each of which one tip presses, as means over holds.
+        position: of the tips, (n, 2) m. Fits begin there, and may end some millimetres away.
+        force: of the tips, (n,) N, as a load cell tells them.
+        settings: before the presses; default `LoadSettings()`.
+        sheet: noise, untouched, sigma, channels and gain, as for `prepare_loads`.
+
+    Raises:
+        InverseError: if there are fewer than `FEWEST` presses, an array has another shape, a place or a force is not a
+            number or the force not above zero, or jit hides the values; and as for `prepare_loads`.
+
+    Example:
+        learned = je.contacts.learn_loads(model, frames, places, forces, noise=noise, untouched=v0)
+        fitter = je.contacts.prepare_loads(model, learned, noise=noise, untouched=v0)
+        print(learned.changed())
+    """
+    require_known("learn_loads", InverseError, dv, position, force)
+    frames, places, forces = (np.asarray(values, float) for values in (dv, position, force))
+    _require_presses(frames, places, forces)
+    usual = settings or LoadSettings()
+    learned, best, logs = usual, -np.inf, np.zeros(3)
+    starts = list(np.column_stack([places, np.full(len(forces), np.log(usual.width)), np.log(forces)])[:, None])
+    for texture in TEXTURES:
+        tried = replace(usual, texture=texture)
+        fitter = prepare_loads(model, tried, **sheet)
+        presses = _Presses(fitter, np.stack([fitter.whitened(frame, 0) for frame in frames]), np.log(forces))
+        logs, fits = _fitted_law(presses, logs, starts)
+        presses = presses.under(logs)
+        error, evidence = _model_error(presses.fitter, presses.y, fits)
+        if evidence < best:
+            break
+        learned, best = replace(tried, law=presses.fitter.sheet.law, model_error=error), evidence
+        starts = [fit.loads[:1, :4] for fit in fits]
+    return learned
+
+
+def _require_presses(frames: np.ndarray, places: np.ndarray, forces: np.ndarray) -> None:
+    count = len(frames)
+    if count < FEWEST or frames.ndim != 2 or places.shape != (count, 2) or forces.shape != (count,):
+        raise InverseError(
+            f"dv {frames.shape}, position {places.shape} and force {forces.shape} tell no law of pressure; give "
+            f"{FEWEST} presses or more, as (n, readings), (n, 2) and (n,)"
+        )
+    wrong = ~(np.isfinite(places).all(1) & np.isfinite(forces) & (forces > 0))
+    if wrong.any():
+        first = int(np.argmax(wrong))
+        raise InverseError(
+            f"press {first} has place {places[first]} m and force {forces[first]} N; give places that are numbers and "
+            "forces above zero"
+        )
+
+
+class _Presses(NamedTuple):
+    """Single presses, and the fitter of a law under which they are fitted.
+
+    | meaning                            | shape  |
+    |------------------------------------|--------|
+    | y: whitened readings               | (n, r) |
+    | log_force: logs of their forces, N | (n,)   |
+    """
+
+    fitter: LoadFitter
+    y: np.ndarray
+    log_force: np.ndarray
+
+    def under(self, logs: np.ndarray) -> "_Presses":
+        """The presses, where amplitude, half pressure and exponent of the law are those of now times exp of these.
+
+        Where fits of frames begin is not prepared anew: presses begin where they are.
+        """
+        parts = [float(part) * math.exp(log) for part, log in zip(jax.tree.leaves(self.law), logs, strict=True)]
+        law = ContactPiezoresistance(*map(jnp.asarray, parts))
+        return self._replace(fitter=eqx.tree_at(lambda fitter: fitter.sheet.law, self.fitter, law))
+
+    @property
+    def law(self) -> ContactPiezoresistance:
+        return self.fitter.sheet.law
+
+    def search(self, k: int) -> Comparison:
+        """The fits of one press, whose force is known."""
+        usual, spread = self.fitter.usual.at[1].set(self.log_force[k]), self.fitter.spread.at[1].set(FORCE_ERROR)
+        return Comparison(replace(self.fitter, usual=usual, spread=spread), self.y[k], None)
+
+    def fits(self, starts: list[np.ndarray]) -> list[Fit]:
+        """One load for each press, from where it begins, (1, 4)."""
+        return [self.search(k).fit(LoadKind.ONE, start, LAST_FALL) for k, start in enumerate(starts)]
+
+    def normal(self, fits: list[Fit], kept: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Normal matrix (3, 3) and gradient (3,) of some presses in the logs of the law, in which loads give way."""
+        matrix, towards = np.zeros((3, 3)), np.zeros(3)
+        for k in kept:
+            slopes, left = self._of_law(k, fits[k])
+            matrix, towards = matrix + slopes.T @ slopes, towards + slopes.T @ left
+        return matrix, towards
+
+    def _of_law(self, k: int, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+        """Slopes of a press in the logs of the law, and what is left of it, in standard deviations, without what its
+        load explains."""
+        search = self.search(k)
+        left, known = search.left(LoadKind.ONE, fit)
+        free = search.free(LoadKind.ONE, fit)
+        y, loads, root, forms = search.put(search.y, fit.loads, fit.root, padded(fit.loads[:1], LoadKind.ONE)[1])
+        unusual, by_loads = map(np.asarray, before(Problem(search.fitter, y, forms, root), loads))
+        slopes = np.concatenate([known.law, np.asarray(known.loads)[:, free]], 1)
+        slopes = solve_triangular(fit.root, slopes, lower=True)
+        along = np.linalg.qr(np.concatenate([slopes[:, 3:], by_loads[:, free]]))[0]
+        whole = np.column_stack([np.pad(slopes[:, :3], ((0, len(unusual)), (0, 0))), np.append(left, -unusual)])
+        rest = whole - along @ (along.T @ whole)
+        return rest[:, :3], rest[:, 3]
+
+
+def _fitted_law(presses: _Presses, logs: np.ndarray, starts: list[np.ndarray]) -> tuple[np.ndarray, list[Fit]]:
+    """Logs (3,) by which the law changes under which the presses are least surprising, and their loads."""
+
+    def surprise(fits: list[Fit], logs: np.ndarray, kept: list[int]) -> float:
+        return sum(improbability(fits[k]) for k in kept) + float(np.sum((logs / SPREAD) ** 2))
+
+    fits = presses.under(logs).fits(starts)
+    for _ in range(STEPS):
+        squares = np.array([fit.square for fit in fits])
+        kept = np.flatnonzero(squares <= UNUSUAL * np.median(squares)).tolist()
+        matrix, towards = presses.under(logs).normal(fits, kept)
+        step = np.linalg.solve(matrix + np.diag(SPREAD**-2.0), towards - logs / SPREAD**2)
+        step *= min(1, MOST_STEP / max(np.abs(step).max(), LEAST_STEP))
+        now, begin = surprise(fits, logs, kept), [fit.loads[:1, :4] for fit in fits]
+        for _ in range(1 + HALVINGS):
+            found = presses.under(logs + step).fits(begin)
+            if surprise(found, logs + step, kept) < now:
+                break
+            step /= 2
+        else:
+            return logs, fits
+        logs, fits = logs + step, found
+        if np.abs(step).max() < LEAST_STEP:
+            break
+    return logs, fits
+
+
+def _model_error(fitter: LoadFitter, y: np.ndarray, fits: list[Fit]) -> tuple[float, float]:
+    """The model error of single presses, of unknown force, and the log of their probability under it."""
+
+    def evidence(own: np.ndarray, fit: Fit, error: float) -> float:
+        under = replace(fitter, model_error=jnp.asarray(error, fitter.model_error.dtype))
+        search = Comparison(under, own, None)
+        return search.evidence(LoadKind.ONE, search.fit(LoadKind.ONE, fit.loads[:1, :4], LAST_FALL))
+
+    each = [partial(evidence, *one) for one in zip(y, fits, strict=True)]
+    error = fitted_model_error(each, float(fitter.model_error))
+    return error, float(np.sum([one(error) for one in each]))

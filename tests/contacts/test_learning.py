@@ -1,0 +1,159 @@
+"""Loads by presses of known place and force: the law of pressure, the texture of the gain, and the model's error."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxeit as je
+from jaxeit.contacts import LoadKind, LoadSettings, learn_loads, prepare_loads
+from jaxeit.contacts.loads import learning
+from jaxeit.contacts.loads.model_error import LAST, STEP, fitted_model_error
+from jaxeit.imaging import InverseError
+from tests.compiled import compiled
+
+from .test_loads import LONG, SPOT, rows
+from .touches import TOUCHES, frames_of, single
+
+PLACES = np.array([[0.04, 0.05], [0.10, 0.06], [0.15, 0.05], [0.06, 0.11], [0.13, 0.12], [0.05, 0.16], [0.14, 0.15]])
+FORCES = np.array([20.0, 10.0, 12.0, 9.0, 24.0, 15.0, 8.0])  # weak ones hardly tell how far a model errs
+LAW = (2.0, 35e3, 1.0)  # not the usual one
+PRESSURES = np.array([3e3, 10e3, 20e3, 30e3])  # Pa, under such presses
+
+
+def change(law):
+    """Relative change of the conductivity by `PRESSURES`."""
+    return np.asarray(law.factor(jnp.asarray(PRESSURES))) - 1
+
+
+def presses_under(law, seed=8):
+    assert len(PLACES) == len(TOUCHES)  # as many frames as elsewhere: compiled once
+    return frames_of([single(*place, force) for place, force in zip(PLACES, FORCES, strict=True)], seed=seed, law=law)
+
+
+def forces_alone(model, settings, frames, **sheet):
+    """Log of the force that the readings of each frame tell, over the true one."""
+    fitter, finder = prepare_loads(model, settings, **sheet), je.prepare_contacts(model, **sheet)
+    return np.log([float(fitter(frame, finder(frame)).one.force[0]) for frame in frames] / FORCES)
+
+
+def test_the_law_is_learned_that_the_presses_follow(ready, monkeypatch):
+    """On a mesh, a coat and a gain that the fit does not know; forces of other presses, by readings alone, are then
+    nearly the true ones."""
+    monkeypatch.setattr(learning, "TEXTURES", (0.0,))  # a scene without protrusions
+    model = ready[0].sheet.model
+    frames, noise, blank = presses_under(LAW)
+    sheet = {"noise": noise, "sigma": je.fit_background(model, blank)}
+    learned = learn_loads(model, frames, PLACES, FORCES, **sheet)
+    truth, usual = change(je.effects.ContactPiezoresistance(*LAW)), change(LoadSettings().law)
+    assert np.abs(np.log(change(learned.law) / truth)).max() < 0.12  # a gain of 0.12 over 7 presses: 0.05
+    assert np.abs(np.log(usual / truth)).max() > 0.2
+    assert learned.model_error < 2.1 * LoadSettings().model_error
+    assert learned.changed().startswith("law = ContactPiezoresistance")
+    before, after = (forces_alone(model, one, frames, **sheet) for one in (LoadSettings(), learned))
+    assert np.sqrt(np.mean(after**2)) < 0.5 * np.sqrt(np.mean(before**2))
+
+
+@pytest.mark.slow
+def test_a_law_that_is_right_stays_and_has_no_texture(ready):
+    model = ready[0].sheet.model
+    frames, noise, blank = presses_under((1.0, 20e3, 1.0))
+    learned = learn_loads(model, frames, PLACES, FORCES, noise=noise, untouched=blank)
+    assert np.abs(np.log(change(learned.law) / change(LoadSettings().law))).max() < 0.12
+    assert learned.texture == 0
+    assert learned.model_error < 2.1 * LoadSettings().model_error
+
+
+@pytest.mark.slow
+def test_a_frame_that_is_not_of_its_press_is_left_out(ready, monkeypatch):
+    """One frame in seven is that of a press at the other end of the sheet."""
+    monkeypatch.setattr(learning, "TEXTURES", (0.0,))
+    model = ready[0].sheet.model
+    frames, noise, blank = presses_under(LAW)
+    mixed = np.where(np.arange(len(FORCES))[:, None] == 1, frames[6], frames)
+    learned = learn_loads(model, mixed, PLACES, FORCES, noise=noise, untouched=blank)
+    truth = change(je.effects.ContactPiezoresistance(*LAW))
+    assert np.abs(np.log(change(learned.law) / truth)).max() < 0.15
+
+
+@pytest.mark.parametrize("loads", [(SPOT,), (LONG,)], ids=["one", "edge"])
+def test_slopes_in_the_law_are_those_of_the_forward_map(ready, loads):
+    """Against differences of the readings under laws that differ a little."""
+    sheet, (theta, forms) = ready[0].sheet, rows(*loads)
+    slopes = np.asarray(compiled(sheet.unknowns, theta, forms).law)
+    step, parts = 1e-4, [float(part) for part in jax.tree.leaves(sheet.law)]
+    for k in range(3):
+        up, down = (
+            _responses(sheet, [part * np.exp(sign * step * (i == k)) for i, part in enumerate(parts)], theta, forms)
+            for sign in (1, -1)
+        )
+        by_differences = (up - down) / (2 * step)
+        error = np.linalg.norm(slopes[:, k] - by_differences) / np.linalg.norm(by_differences)
+        assert error < 0.03  # elements away from the loads are left out
+
+
+def _responses(sheet, parts, theta, forms):
+    return np.asarray(compiled(_response, sheet, je.effects.ContactPiezoresistance(*parts), theta, forms))
+
+
+def _response(sheet, law, theta, forms):
+    return replace(sheet, law=law).response(theta, forms)
+
+
+def test_a_texture_is_an_error_that_a_frame_does_not_tell(ready):
+    """Larger textures make the place of a load less sure, and no reading another one."""
+    fitter, _, _, noise = ready
+    sheet = {"noise": noise, "sigma": fitter.sheet.sigma}
+    rough = prepare_loads(fitter.sheet.model, LoadSettings(texture=0.2), **sheet)
+    theta, forms = rows(SPOT)
+    plain, known = (compiled(one.sheet.unknowns, theta, forms) for one in (fitter, rough))
+    np.testing.assert_allclose(known.value, plain.value, rtol=1e-12)
+    added = np.asarray(known.nuisances) @ np.asarray(known.nuisances).T
+    added -= np.asarray(plain.nuisances) @ np.asarray(plain.nuisances).T
+    values = np.linalg.eigvalsh(added)
+    assert values.min() > -1e-9 * values.max()
+    assert values.max() > 1  # of the variance of the noise
+
+
+def test_presses_that_tell_no_law_are_refused(ready):
+    model, frames = ready[0].sheet.model, np.zeros((7, 550))
+    noise = ready[3]
+    with pytest.raises(InverseError, match=r"dv \(3, 550\), position .* give 6 presses or more"):
+        learn_loads(model, frames[:3], PLACES[:3], FORCES[:3], noise=noise)
+    with pytest.raises(InverseError, match=r"position \(6, 2\)"):
+        learn_loads(model, frames, PLACES[:6], FORCES, noise=noise)
+    with pytest.raises(InverseError, match=r"press 2 has place .* force 0.0 N"):
+        learn_loads(model, frames, PLACES, np.where(np.arange(7) == 2, 0.0, FORCES), noise=noise)
+    with pytest.raises(InverseError, match="press 4 has place"):
+        learn_loads(model, frames, np.where(np.arange(7)[:, None] == 4, np.nan, PLACES), FORCES, noise=noise)
+    with pytest.raises(InverseError, match="learn_loads decides by looking at values"):
+        jax.jit(lambda dv: learn_loads(model, dv, PLACES, FORCES, noise=noise).gain)(frames)
+
+
+def test_the_error_is_that_which_nine_of_ten_frames_stay_below():
+    """Of frames whose evidence is largest at an error of their own."""
+
+    def frame(own):
+        return lambda error: -100 * np.log(error / own) ** 2
+
+    own = 0.01 * STEP ** np.array([0, 1, 1, 2, 2, 2, 3, 3, 4, 6])
+    assert fitted_model_error([frame(one) for one in own], 0.01) == pytest.approx(0.01 * STEP**6)
+    assert fitted_model_error([frame(one) for one in own[:-1]] * 2, 0.01) == pytest.approx(0.01 * STEP**4)
+    assert fitted_model_error([frame(1.0)], 0.01) == pytest.approx(LAST, rel=0.4)
+    assert fitted_model_error([frame(1e-9)], 0.0) == pytest.approx(1e-3)  # no error at all cannot be tried
+
+
+def test_frames_of_which_no_fit_converges_tell_no_error():
+    with pytest.raises(InverseError, match=r"fitted to 1 of 2 frames, .* frames \[1\]"):
+        fitted_model_error([lambda error: -error, lambda error: -np.inf], 0.01)
+
+
+def test_kinds_are_those_of_the_settings_of_usual_loads(ready):
+    """A fitter of a texture tells one tip as one."""
+    fitter, finder, frames, noise = ready
+    rough = prepare_loads(
+        fitter.sheet.model, LoadSettings(texture=0.2, model_error=0.01), noise=noise, sigma=fitter.sheet.sigma
+    )
+    assert rough(frames[0], finder(frames[0])).kind is LoadKind.ONE
