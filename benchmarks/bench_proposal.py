@@ -14,6 +14,8 @@ than one load is the most probable. "surprise": mean of minus the log probabilit
 reliability: how often the kinds that the network states are the true ones, on touches of all kinds. Pairs nearer than
 `LoadSettings.nearest` and edges shorter than `LoadSettings.shortest` are one load, as the network and the fits have it.
 
+alone: place and force of single tips of 6 to 30 mm, 4 to 25 N, by readings alone, before and after those presses.
+
 times: milliseconds a frame of each way.
 
 held_out: figures of the shipped numbers on skins that their training held out.
@@ -27,8 +29,10 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from scipy.stats import norm
 
 import jaxeit as je
+from calib.calibration.localisation.ellipses import INSIDE_90
 from jaxeit.contacts import LoadFitter, LoadKind, Loads, Proposal
 
 from .bench_loads import Touch, reliability, touches
@@ -36,7 +40,7 @@ from .clock import seconds
 from .harness import Question, Run
 from .problems import Pressed, fit_model, matched
 from .rows import Row, grouped, rounded
-from .second_simulator import FORCES, Press, Wear, described, recorded as pressed
+from .second_simulator import FORCES, TIPS, Press, Wear, described, recorded as pressed
 
 NAMES = ("one", "two, 1:1, 20 mm", "two, 1:1, 30 mm", "edge, 40 mm", "edge, 60 mm", "three")
 SHIPPED = ("testbed", "chest")
@@ -119,9 +123,18 @@ def noisy_frames(
     """Touches of `NAMES` on the skin of a seed, with a noisy frame each, and what tells them after some presses."""
     rng = np.random.default_rng(seed)
     given = [touch for touch in touched(name, rng, singles, others) if touch.name in NAMES]
+    frames, ready = _seen(name, seed, tips(given), presses, rng)
+    for touch, frame in zip(given, frames, strict=True):
+        yield touch, frame, ready
+
+
+def _seen(
+    name: str, seed: int, given: list[Press], presses: int, rng: np.random.Generator
+) -> tuple[Iterator[np.ndarray], Ready]:
+    """Noisy frames of a skin under presses, and what tells them after some further presses."""
     own = np.random.default_rng([seed, 1])
     lessons, model = teaching(name, presses, own), fit_model(name)
-    both = pressed(seed, [*tips(given), *lessons], Wear(), name)
+    both = pressed(seed, [*given, *lessons], Wear(), name)
     known = {"noise": both.std, "sigma": je.fit_background(model, both.blank(rng))}
     noisy = both.change[len(given) :] + both.noise * own.normal(size=(presses, both.change.shape[1]))
     fitter = taught = je.contacts.prepare_loads(model, **known)
@@ -131,8 +144,8 @@ def noisy_frames(
         print(learned.changed(), flush=True)
         taught = je.contacts.prepare_loads(model, learned, **known)
     ready = Ready(je.contacts.load_proposal(name), fitter, taught, je.prepare_contacts(model, **known))
-    for touch, change in zip(given, both.change, strict=False):
-        yield touch, change + both.noise * rng.normal(size=change.size), ready
+    changes = both.change[: len(given)]
+    return (change + both.noise * rng.normal(size=change.size) for change in changes), ready
 
 
 def teaching(name: str, count: int, rng: np.random.Generator) -> list[Press]:
@@ -157,6 +170,45 @@ def _fitted(found: Loads) -> Answer:
         return np.asarray(shape.position)
 
     return Answer(np.asarray(found.probability), place)
+
+
+def alone(run: Run) -> Iterator[Row]:
+    """Place and force of single tips by their readings alone, before and after presses have taught the fits."""
+    skins, count = run.sizes((6, 16), (1, 2))
+    for name in SHIPPED:
+        every = []
+        for seed in range(FIRST_SEED + 80, FIRST_SEED + 80 + skins):
+            rng = np.random.default_rng(seed)
+            given = [
+                one._replace(tip=tip)
+                for one, tip in zip(teaching(name, count, rng), rng.uniform(*TIPS, count), strict=True)
+            ]
+            frames, ready = _seen(name, seed, given, PRESSES, rng)
+            for press, frame in zip(given, frames, strict=True):
+                every += [{"way": way} | _missed(press, ready.searched(frame, way == TAUGHT)) for way in (FITS, TAUGHT)]
+            print(f"{name} {seed}", flush=True)
+        for way, mine in grouped(every, "way").items():
+            means = {
+                key: float(np.mean([row[key] for row in mine])) for key in ("place_covered", "force_covered", "several")
+            }
+            for key in ("place_mm", "force"):
+                off = [row[key] for row in mine]
+                means |= {key: float(np.median(off)), f"{key}_90": float(np.quantile(off, 0.9))}
+            yield {"alone": [{"skin": name, "way": way, "frames": len(mine)} | rounded(means)]}
+
+
+def _missed(press: Press, found: Loads) -> Row:
+    """By how much the best single load misses a press, and whether its 90 % ellipse and interval hold."""
+    one, covariance = found.one, np.asarray(found.one.covariance)
+    away = np.asarray(one.position[0]) - press.places[0]
+    log_off = float(np.log(one.force[0] / press.forces[0]))
+    return {
+        "place_mm": 1e3 * float(np.linalg.norm(away)),
+        "force": abs(float(np.expm1(log_off))),
+        "place_covered": bool(away @ np.linalg.solve(covariance[:2, :2], away) < INSIDE_90**2),
+        "force_covered": abs(log_off) < norm.ppf(0.95) * np.sqrt(covariance[3, 3]),
+        "several": found.kind in (LoadKind.TWO, LoadKind.MORE),
+    }
 
 
 def times(run: Run) -> Iterator[Row]:
@@ -276,7 +328,9 @@ def shipped(run: Run) -> Iterator[Row]:
         yield {"held_out": [{"skin": name, "case": CASES[case], "kind": kind} | row for case, kind, row in kinds]}
 
 
-main = Question("proposal", __doc__, {"stated": stated, "shipped": shipped, "ways": ways, "times": times})
+main = Question(
+    "proposal", __doc__, {"stated": stated, "shipped": shipped, "ways": ways, "alone": alone, "times": times}
+)
 
 if __name__ == "__main__":
     main()

@@ -4,15 +4,16 @@ import signal
 from importlib.metadata import version
 from pathlib import Path
 
-# Before JAX is imported, and for the processes that tests start: half of the suite's time was XLA at work on programs
-# that run once. At this level XLA and what it compiles take least together. `make slow` compiles as users do.
+# Before JAX is imported, and for the processes that tests start: two thirds of the suite's time were XLA at work on
+# programs that run once. At this level XLA and what it compiles take least together. `make slow` compiles as users do.
 if "xla_backend_optimization_level" not in os.environ.get("XLA_FLAGS", ""):
-    flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=1"]
+    flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=0"]
     flags.append("--xla_llvm_disable_expensive_passes=true")
     # The verbs of jaxeit are compiled without fusion emitters, and so in half the time is what the tests compile
-    # themselves. XLA ends the process for a flag that it does not know, and jaxlib 0.11 knows this one no more.
+    # themselves; a program in one piece, as each worker has a core. XLA ends the process for a flag that it does not
+    # know, and jaxlib 0.11 knows the first of these no more.
     if version("jaxlib").startswith("0.10."):
-        flags.append("--xla_cpu_use_fusion_emitters=false")
+        flags += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
     os.environ["XLA_FLAGS"] = " ".join(flags).strip()
 # Nobody reads where in Python each operation of a program comes from: 100 frames of every one, unless told otherwise.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")

@@ -191,18 +191,17 @@ class _Search:
         home = np.asarray(skin.electrode_positions, float)
         if limits.margin is None:
             limits = replace(limits, margin=float(skin.domain.boundary_distance(home).min()))
-        mirror = _mirror(skin, home) if limits.symmetric else np.eye(2 * len(home))
-        model = discretise(Scene(skin), fidelity)
-        contacts = SiteContacts.of(model, settings, sites_of(model, settings.columns))
-        objective = _Objective(criterion, model, electrode_motion(model), contacts, jnp.asarray(pattern, jnp.int32))
-        search = _Search(skin, limits, fidelity, objective, _value(objective), home, mirror)
-        slack = np.min(search.slack(home))
+        slack = np.min(_slack(skin, limits, home, home))  # before anything is computed
         if slack < -SLACK:
             raise ProtocolError(
                 f"{skin.name}: the electrodes break the limits where they sit now, by {-1e3 * slack:.3g} mm; give a "
                 "smaller distance or margin, or other circles to keep out of"
             )
-        return search
+        mirror = _mirror(skin, home) if limits.symmetric else np.eye(2 * len(home))
+        model = discretise(Scene(skin), fidelity)
+        contacts = SiteContacts.of(model, settings, sites_of(model, settings.columns))
+        objective = _Objective(criterion, model, electrode_motion(model), contacts, jnp.asarray(pattern, jnp.int32))
+        return _Search(skin, limits, fidelity, objective, _value(objective), home, mirror)
 
     @property
     def error(self) -> float:
@@ -228,7 +227,7 @@ class _Search:
             jac=True,
             method="SLSQP",
             bounds=[(-1.0, 1.0)] * here.size,
-            constraints={"type": "ineq", "fun": lambda u: self.slack(here + shift(u)) / size},
+            constraints={"type": "ineq", "fun": lambda u: self._slack(here + shift(u)) / size},
             options={"maxiter": ITERATIONS, "ftol": TOLERANCE},
         )
         skin = with_positions(self.skin, here + shift(found.x))
@@ -236,16 +235,20 @@ class _Search:
         there = replace(objective, model=model, motion=electrode_motion(model))
         return replace(self, skin=skin, objective=there, value=_value(there))
 
-    def slack(self, places: np.ndarray) -> np.ndarray:
-        """Lengths, m, that are zero or more where the limits hold at these places (electrodes, 2)."""
-        domain, limits, near = self.skin.domain, self.limits, np.triu_indices(len(places), 1)
-        inside = np.where(domain.contains(places), 1.0, -1.0) * domain.boundary_distance(places)
-        parts = [np.linalg.norm(places[near[0]] - places[near[1]], axis=1) - limits.distance]
-        parts += [inside - (limits.margin or 0.0)]
-        parts += [np.linalg.norm(places - circle[:2], axis=1) - circle[2] for circle in limits.keep_out]
-        if np.isfinite(limits.farthest):
-            parts.append(limits.farthest - np.linalg.norm(places - self.home, axis=1))
-        return np.concatenate(parts)
+    def _slack(self, places: np.ndarray) -> np.ndarray:
+        return _slack(self.skin, self.limits, self.home, places)
+
+
+def _slack(skin: Skin, limits: PlacementLimits, home: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Lengths, m, that are zero or more where the limits hold at places (electrodes, 2) of electrodes from ``home``."""
+    near = np.triu_indices(len(places), 1)
+    inside = np.where(skin.domain.contains(places), 1.0, -1.0) * skin.domain.boundary_distance(places)
+    parts = [np.linalg.norm(places[near[0]] - places[near[1]], axis=1) - limits.distance]
+    parts += [inside - (limits.margin or 0.0)]
+    parts += [np.linalg.norm(places - circle[:2], axis=1) - circle[2] for circle in limits.keep_out]
+    if np.isfinite(limits.farthest):
+        parts.append(limits.farthest - np.linalg.norm(places - home, axis=1))
+    return np.concatenate(parts)
 
 
 def _value(objective: _Objective) -> float:
