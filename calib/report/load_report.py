@@ -1,13 +1,13 @@
 """The part of a report about what touched the skin, window by window: probabilities, places and forces."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 
 import numpy as np
 
 from jaxeit.contacts import LoadKind
 
-from ..calibration.localisation.load_windows import LEARNED, left_by_fits
+from ..calibration.localisation.load_windows import left_by_fits
 from .figures.force_series import SERIES
 from .figures.panels import WIDER, Panel, chart_axes, panel
 from .figures.parts import MM
@@ -29,11 +29,12 @@ CAPTION = (
 Windows = Mapping[str, np.ndarray]
 
 
-def load_parts(windows: Windows, *, simulated: bool) -> list[str]:
+def load_parts(windows: Windows, learned: Sequence[str] = (), *, simulated: bool) -> list[str]:
     """The part of a page, as elements of HTML; empty without windows.
 
     Args:
         windows: arrays of the group "loads" of a file of force maps, by their names.
+        learned: what presses of the calibration told the fits, a line each.
 
     Raises:
         ReportError: matplotlib is not installed.
@@ -46,7 +47,7 @@ def load_parts(windows: Windows, *, simulated: bool) -> list[str]:
     return [
         "<h2>What touched the skin</h2>",
         f"<figure>{shown}<figcaption>{escape(CAPTION)}</figcaption></figure>",
-        *_notes(windows),
+        *_notes(windows, learned),
         _table(windows),
     ]
 
@@ -67,10 +68,10 @@ def panel_of_kinds(windows: Windows, *, simulated: bool) -> Panel:
     return panel(figure, axes, "kinds", "Probabilities of what touched the skin over time")
 
 
-def _notes(windows: Windows) -> list[str]:
+def _notes(windows: Windows, learned: Sequence[str]) -> list[str]:
     left = left_by_fits(windows["misfit"]) if "misfit" in windows else ""  # a file of an early version has none
-    learned = [f"Presses of the calibration told the fits that {line}" for line in windows.get(LEARNED, ())]
-    said = [*([f"Of these windows, {left}"] if left else []), *learned]
+    said = [f"Of these windows, {left}"] if left else []
+    said += [f"Presses of the calibration told the fits that {line}" for line in learned]
     return [*_of_network(windows), *(f"<p>{escape(line)}.</p>" for line in said)]
 
 

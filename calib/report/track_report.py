@@ -19,7 +19,7 @@ from .figures.force_series import SERIES
 from .figures.panels import WIDER, Panel, chart_axes, panel, sheet_axes
 from .figures.parts import MM, require_matplotlib
 from .html_parts import PAGE, STYLE, html_table, number_text, with_error
-from .load_report import Windows, load_parts
+from .load_report import load_parts
 
 ELLIPSES = 5  # of a contact, where it presses with at least half of its largest force
 MOST_POINTS = 2000  # of a contact's line
@@ -47,22 +47,23 @@ def write_track_report(path: str | Path, forces: str | Path, skin: je.Skin) -> P
     with open_archive(forces, FORMAT) as archive:
         attrs, known = archive.attrs, archive.arrays
         rows = {name: known[TRACKS + name].read() for name in ABOUT if TRACKS + name in known}
-        names = (*load_windows.ABOUT, load_windows.LEARNED)
-        loads = {name: known[LOADS + name].read() for name in names if LOADS + name in known}
-    text = _page(rows, loads, attrs, skin)
+        loads = {name: known[LOADS + name].read() for name in load_windows.ABOUT if LOADS + name in known}
+        where = LOADS + load_windows.LEARNED
+        learned = [str(line) for line in known[where].read()] if where in known else []
+        told = load_parts(loads, learned, simulated=bool(attrs["simulated"]))
+    text = _page(rows, told, attrs, skin)
     with replacing(page) as temporary:
         temporary.write_bytes(text.encode())
     return page
 
 
-def _page(rows: Rows, loads: Windows, attrs: Mapping[str, Any], skin: je.Skin) -> str:
+def _page(rows: Rows, told: list[str], attrs: Mapping[str, Any], skin: je.Skin) -> str:
     simulated = bool(attrs["simulated"])
     title = f"Contacts in {attrs['session']}"
     parts = [f"<h1>{escape(title)}</h1>"]
     if simulated:
         parts.append('<p class="banner" role="note"><strong>SIMULATED</strong> The recording is simulated.</p>')
     parts += [f"<p>Note: {escape(line)}</p>" for line in str(attrs.get("outside", "")).split("\n") if line]
-    told = load_parts(loads, simulated=simulated)
     if not rows or not len(rows["time"]):
         parts += [] if told else ["<p>No contact was followed.</p>"]
     else:

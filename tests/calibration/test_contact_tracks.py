@@ -21,7 +21,7 @@ from calib.calibration.localisation.contact_tracks import (
     NotFollowed,
     pad_errors,
 )
-from calib.calibration.localisation.load_windows import ABOUT as LOAD_ARRAYS, MOST
+from calib.calibration.localisation.load_windows import ABOUT as LOAD_ARRAYS, LEARNED, MOST
 from calib.calibration.localisation.quiet_frames import QuietFrames
 from calib.cli import main
 from calib.report.track_report import by_number, write_track_report
@@ -189,11 +189,13 @@ def test_a_report_tells_what_touched_the_skin(tmp_path, skin):
         "force": force,
     }
     arrays = {LOADS + name: (part, *LOAD_ARRAYS[name]) for name, part in windows.items()}
+    arrays[LOADS + LEARNED] = (np.array(["pressure adds < 150 %"]), "1", "what presses told")
     write_archive(tmp_path / "map.h5", FORMAT, {"session": "s.h5", "simulated": 1}, arrays)
     page = write_track_report(tmp_path / "r.html", tmp_path / "map.h5", skin).read_text()
     assert "No contact" not in page
     assert page.count("<svg") == 1
     assert "1 of 2 windows are unlike" in page
+    assert "told the fits that pressure adds &lt; 150 %.</p>" in page
     cells = re.findall(r"<t[hd][^>]*>([^<]*)</t[hd]>", page[page.index("<tbody>") :])
     assert cells[10:] == ["2.00", "3.00", "an edge", "0 %", "2 %", "17 %", "81 %", "0 %", "123, 56", "7.2"]
 
