@@ -50,6 +50,7 @@ HOST = {
     "parse_values": "reads a text",
     "fidelity_choices": _PREPARES,
     "LoadFitter": "compares kinds of loads of one frame, on the host, and says so under jit",
+    "learn_loads": _PREPARES,
     "prepare_loads": _PREPARES,
     "load_proposal": _DESCRIBES,
     "shipped_proposal": _DESCRIBES,
