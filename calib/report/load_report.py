@@ -71,7 +71,7 @@ def panel_of_kinds(windows: Windows, *, simulated: bool) -> Panel:
 def _notes(windows: Windows, learned: Sequence[str]) -> list[str]:
     left = left_by_fits(windows["misfit"]) if "misfit" in windows else ""  # a file of an early version has none
     said = [f"Of these windows, {left}"] if left else []
-    said += [f"Presses of the calibration told the fits that {line}" for line in learned]
+    said += [f"What presses of the calibration taught the fits: {line}" for line in learned]
     return [*_of_network(windows), *(f"<p>{escape(line)}.</p>" for line in said)]
 
 

@@ -195,7 +195,7 @@ def test_a_report_tells_what_touched_the_skin(tmp_path, skin):
     assert "No contact" not in page
     assert page.count("<svg") == 1
     assert "1 of 2 windows are unlike" in page
-    assert "told the fits that pressure adds &lt; 150 %.</p>" in page
+    assert "taught the fits: pressure adds &lt; 150 %.</p>" in page
     cells = re.findall(r"<t[hd][^>]*>([^<]*)</t[hd]>", page[page.index("<tbody>") :])
     assert cells[10:] == ["2.00", "3.00", "an edge", "0 %", "2 %", "17 %", "81 %", "0 %", "123, 56", "7.2"]
 

@@ -78,7 +78,7 @@ def test_loads_are_fitted_with_the_layer_that_the_calibration_learned(calibratio
 def test_loads_are_fitted_as_the_presses_of_the_calibration_tell(calibration, asked, monkeypatch):
     """Unless the user says what is known of loads."""
     told, own = je.contacts.LoadSettings(texture=0.1), je.contacts.LoadSettings.round_tips()
-    monkeypatch.setattr(load_windows, "learned_loads", lambda *_: told)
+    monkeypatch.setattr(load_windows, "learned_loads", lambda *_: (told, "told"))
     assert asked(calibration)[1] is told
     assert asked(calibration, own)[1] is own
 
@@ -103,16 +103,21 @@ def test_whole_presses_of_a_calibration_tell_loads(calibration, model, monkeypat
 
     monkeypatch.setattr(je.contacts, "learn_loads", learn)
     known = {"noise": np.ones(readings), "channels": channels}
-    found = learned_loads(replace(calibration, probes=probes), model, known)
+    found, line = learned_loads(replace(calibration, probes=probes), model, known)
     assert found.texture == 0.1
+    assert line == render_loads(found)
     (dv, position, force, gain), whole = given[0], [0, 1, *range(3, MOST + 1)]
     np.testing.assert_array_equal(position, probes.position[whole])
     np.testing.assert_array_equal(force, probes.force[whole])
     assert dv.shape == (MOST, readings)
     assert gain is calibration.layer
     few = replace(calibration, probes=presses(FEWEST - 1, readings, 4))
-    assert learned_loads(few, model, known) is None
-    assert learned_loads(replace(calibration, probes=None), model, known) is None
+    found, line = learned_loads(few, model, known)
+    assert found is None
+    assert f"as {FEWEST - 1} presses of the calibration lack no reading, and {FEWEST} are needed" in line
+    found, line = learned_loads(replace(calibration, probes=None), model, known)
+    assert found is None
+    assert "kept no presses" in line
     assert len(given) == 1
 
 
@@ -123,7 +128,9 @@ def test_presses_whose_fits_do_not_converge_tell_nothing(calibration, model, mon
     monkeypatch.setattr(je.contacts, "learn_loads", learn)
     readings = calibration.recon.readings
     probes = replace(calibration, probes=presses(FEWEST, readings, 4))
-    assert learned_loads(probes, model, {"channels": np.ones(readings, bool)}) is None
+    found, line = learned_loads(probes, model, {"channels": np.ones(readings, bool)})
+    assert found is None
+    assert line == "nothing by the presses of the calibration: no fit converges"
 
 
 def test_what_was_learned_is_told_in_one_line():
@@ -180,7 +187,7 @@ def test_two_contacts_are_told_over_time(session, tmp_path, capsys):
     assert main([*searching[:-2], "--report", str(tmp_path / "r.html")]) == 0  # the shipped network, by default
     page = (tmp_path / "r.html").read_text()
     assert "What touched the skin" in page
-    assert "Presses of the calibration told the fits that pressure adds up to" in page
+    assert "What presses of the calibration taught the fits: pressure adds up to" in page
     proposed = calib.session.read_archive(out, "skin-forcemap").arrays
     assert (proposed["loads/distance"] < 1).all()
     told = both & (proposed["loads/probability"].argmax(1) == 2)

@@ -10,7 +10,7 @@ import pytest
 import jaxeit as je
 from jaxeit.contacts import LoadKind, LoadSettings, learn_loads, prepare_loads
 from jaxeit.contacts.loads import learning
-from jaxeit.contacts.loads.comparison import Comparison
+from jaxeit.contacts.loads.comparison import Comparison, Fit
 from jaxeit.contacts.loads.model_error import LAST, STEP, fitted_model_error
 from jaxeit.imaging import InverseError
 from tests.compiled import compiled
@@ -159,3 +159,20 @@ def test_kinds_are_those_of_the_settings_of_usual_loads(ready):
         fitter.sheet.model, LoadSettings(texture=0.2, model_error=0.01), noise=noise, sigma=fitter.sheet.sigma
     )
     assert rough(frames[0], finder(frames[0])).kind is LoadKind.ONE
+
+
+def test_presses_that_tell_nothing_are_not_counted(ready, monkeypatch):
+    """The texture is that under which the others are most probable."""
+    fitter, _, frames, noise = ready
+    nothing = -np.inf
+
+    def told(evidences):
+        found = iter(evidences)
+        monkeypatch.setattr(learning, "prepare_loads", lambda *_, **__: fitter)
+        monkeypatch.setattr(learning, "_fitted_law", lambda *_: (np.zeros(3), [Fit(np.zeros((3, 6)), 0.0, None, None)]))
+        monkeypatch.setattr(learning, "_model_error", lambda *_: (0.01, np.array([*next(found), *np.zeros(5)])))
+        return learn_loads(fitter.sheet.model, frames, PLACES, FORCES, noise=noise)
+
+    assert told([(nothing, -10.0), (-99.0, -5.0), (nothing, -9.0)]).texture == learning.TEXTURES[1]
+    assert told([(-1.0, -10.0), (nothing, -5.0)]).texture == 0  # told before, and not any longer
+    assert told([(np.nan, -10.0), (0.0, -12.0)]).texture == 0

@@ -12,25 +12,27 @@ from ..calibration import Calibration
 FEWEST, MOST = 12, 16  # presses from which loads are learned; more take longer and hardly tell more
 
 
-def learned_loads(calibration: Calibration, model: je.Model, known: dict[str, Any]) -> LoadSettings | None:
-    """Settings of loads by the presses that the calibration kept (`jaxeit.contacts.learn_loads`).
+def learned_loads(calibration: Calibration, model: je.Model, known: dict[str, Any]) -> tuple[LoadSettings | None, str]:
+    """Settings of loads by the presses that the calibration kept (`jaxeit.contacts.learn_loads`), and a line of them.
 
-    None where it kept too few that are whole, as one of an early version, or where fits of them do not converge.
+    No settings, and why not, where it kept too few that are whole, as one of an early version, or where fits of them do
+    not converge.
 
     Args:
         known: noise, sigma and channels of the frames whose loads are to be fitted.
     """
     probes = calibration.probes
     if probes is None:
-        return None
+        return None, "nothing, as the calibration kept no presses; calibrate anew"
     whole = np.flatnonzero(np.isfinite(probes.dv[:, known["channels"]]).all(1))[:MOST]  # each far from those before it
     if len(whole) < FEWEST:
-        return None
+        return None, f"nothing, as {len(whole)} presses of the calibration lack no reading, and {FEWEST} are needed"
     frames, places, forces = probes.dv[whole], probes.position[whole], probes.force[whole]
     try:
-        return je.contacts.learn_loads(model, frames, places, forces, gain=calibration.layer, **known)
-    except je.imaging.InverseError:
-        return None
+        learned = je.contacts.learn_loads(model, frames, places, forces, gain=calibration.layer, **known)
+    except je.imaging.InverseError as error:
+        return None, f"nothing by the presses of the calibration: {error}"
+    return learned, render_loads(learned)
 
 
 def render_loads(loads: LoadSettings) -> str:

@@ -17,7 +17,7 @@ from jaxeit.contacts import LoadKind, Loads, LoadSettings, Proposal
 
 from ...presses.streams import finite_mean
 from ..calibration import Calibration
-from .learned_loads import learned_loads, render_loads
+from .learned_loads import learned_loads
 from .press_images import fit_untouched_sheet
 from .quiet_frames import QuietFrames
 
@@ -128,17 +128,18 @@ def fit_windows(
     sheet, _ = fit_untouched_sheet(model, seen.quiet.untouched, channels)
     of_means = np.where(channels, noise, 1.0) / np.sqrt(np.median([window.frames for window in seen.windows]))
     known = {"noise": of_means, "sigma": sheet, "channels": channels}
-    learned = learned_loads(calibration, model, known) if settings is None else None
-    fitter = je.contacts.prepare_loads(model, settings or learned, gain=calibration.layer, **known)
+    told = ""
+    if settings is None:
+        settings, told = learned_loads(calibration, model, known)
+    fitter = je.contacts.prepare_loads(model, settings, gain=calibration.layer, **known)
     finder = je.prepare_contacts(model, **known)
     found = [_found(fitter, finder, proposal, window, channels) for window in progress(seen.windows)]
     loads, distance = zip(*found, strict=True)
     outside = int(np.sum(np.array(distance) > 1))
     kinds, stated = zip(*((one.kind, float(np.max(one.probability))) for one in loads), strict=True)
     arrays = _arrays(seen.windows, found)
-    told = "" if learned is None else render_loads(learned)
     if told:
-        arrays[LEARNED] = (np.array([told]), "1", "what presses of the calibration told of loads")
+        arrays[LEARNED] = (np.array([told]), "1", "what presses of the calibration told the fits")
     return SeenLoads(arrays, kinds, stated, outside=outside, left=left_by_fits(arrays["misfit"][0]), learned=told)
 
 

@@ -65,7 +65,7 @@ def learn_loads(
     settings: LoadSettings | None = None,
     **sheet: Any,
 ) -> LoadSettings:
-    """Settings of loads by presses of known place and force, for `prepare_loads` and for a tracker.
+    """Settings of loads for `prepare_loads`, by presses of known place and force.
 
     The law of pressure, the texture of the gain and the model error are learned; the other settings stay. Give presses
     of several forces all over the sheet: one force alone tells one number of the law.
@@ -90,7 +90,7 @@ def learn_loads(
     frames, places, forces = (np.asarray(values, float) for values in (dv, position, force))
     _require_presses(frames, places, forces)
     usual = settings or LoadSettings()
-    learned, best, logs = usual, -np.inf, np.zeros(3)
+    learned, best, logs, counted = usual, -np.inf, np.zeros(3), np.ones(len(forces), bool)
     starts = list(np.column_stack([places, np.full(len(forces), np.log(usual.width)), np.log(forces)])[:, None])
     for texture in TEXTURES:
         tried = replace(usual, texture=texture)
@@ -98,10 +98,12 @@ def learn_loads(
         presses = _Presses(fitter, np.stack([fitter.whitened(frame, 0) for frame in frames]), np.log(forces))
         logs, fits = _fitted_law(presses, logs, starts)
         presses = presses.under(logs)
-        error, evidence = _model_error(presses.fitter, presses.y, fits)
-        if evidence < best:
+        error, evidences = _model_error(presses.fitter, presses.y, fits)
+        if learned is usual:
+            counted = np.isfinite(evidences)  # a press that no load explains tells nothing under any texture
+        if not (evidence := float(evidences[counted].sum())) > best:
             break
-        learned, best = replace(tried, law=presses.fitter.sheet.law, model_error=error), evidence
+        learned, best = replace(tried, law=presses.law, model_error=error), evidence
         starts = [fit.loads[:1, :4] for fit in fits]
     return learned
 
@@ -146,6 +148,7 @@ class _Presses(NamedTuple):
 
     @property
     def law(self) -> ContactPiezoresistance:
+        """The law of pressure."""
         return self.fitter.sheet.law
 
     def search(self, k: int) -> Comparison:
@@ -208,8 +211,8 @@ def _fitted_law(presses: _Presses, logs: np.ndarray, starts: list[np.ndarray]) -
     return logs, fits
 
 
-def _model_error(fitter: LoadFitter, y: np.ndarray, fits: list[Fit]) -> tuple[float, float]:
-    """The model error of single presses, of unknown force, and the log of their probability under it."""
+def _model_error(fitter: LoadFitter, y: np.ndarray, fits: list[Fit]) -> tuple[float, np.ndarray]:
+    """The model error of single presses, of unknown force, and the log of the probability of each under it, (n,)."""
 
     def evidence(own: np.ndarray, fit: Fit, error: float) -> float:
         under = replace(fitter, model_error=jnp.asarray(error, fitter.model_error.dtype))
@@ -218,4 +221,4 @@ def _model_error(fitter: LoadFitter, y: np.ndarray, fits: list[Fit]) -> tuple[fl
 
     each = [partial(evidence, *one) for one in zip(y, fits, strict=True)]
     error = fitted_model_error(each, float(fitter.model_error))
-    return error, float(np.sum([one(error) for one in each]))
+    return error, np.array([one(error) for one in each])
