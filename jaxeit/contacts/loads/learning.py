@@ -19,14 +19,14 @@ What is left even so is the model error (`fitted_model_error`).
 import math
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 from scipy.linalg import solve_triangular
 
 from ..._compile import require_known
@@ -36,7 +36,7 @@ from ...model.discretisation import Model
 from .comparison import LAST_FALL, Comparison, Fit, improbability, padded
 from .fitter import LoadFitter
 from .model_error import fitted_model_error
-from .preparation import prepare_loads
+from .preparation import AbstractGain, prepare_loads
 from .programs import Problem, before
 from .result import LoadKind
 from .settings import LoadSettings
@@ -63,7 +63,12 @@ def learn_loads(
     position: Float[ArrayLike, "n 2"],
     force: Float[ArrayLike, " n"],
     settings: LoadSettings | None = None,
-    **sheet: Any,
+    *,
+    noise: Float[ArrayLike, "..."],
+    untouched: Float[ArrayLike, " readings"] | None = None,
+    sigma: Float[Array, " elements"] | None = None,
+    channels: Bool[ArrayLike, " readings"] | None = None,
+    gain: AbstractGain | None = None,
 ) -> LoadSettings:
     """Settings of loads for `prepare_loads`, by presses of known place and force.
 
@@ -75,7 +80,7 @@ def learn_loads(
         position: of the tips, (n, 2) m. Fits begin there, and may end some millimetres away.
         force: of the tips, (n,) N, as a load cell tells them.
         settings: before the presses; default `LoadSettings()`.
-        sheet: noise, untouched, sigma, channels and gain, as for `prepare_loads`.
+        noise, untouched, sigma, channels, gain: as for `prepare_loads`.
 
     Raises:
         InverseError: if there are fewer than `FEWEST` presses, an array has another shape, a place or a force is not a
@@ -90,11 +95,12 @@ def learn_loads(
     frames, places, forces = (np.asarray(values, float) for values in (dv, position, force))
     _require_presses(frames, places, forces)
     usual = settings or LoadSettings()
+    prepare = partial(prepare_loads, model, noise=noise, untouched=untouched, sigma=sigma, channels=channels, gain=gain)
     learned, best, logs, counted = usual, -np.inf, np.zeros(3), np.ones(len(forces), bool)
     starts = list(np.column_stack([places, np.full(len(forces), np.log(usual.width)), np.log(forces)])[:, None])
     for texture in TEXTURES:
         tried = replace(usual, texture=texture)
-        fitter = prepare_loads(model, tried, **sheet)
+        fitter = prepare(tried)
         presses = _Presses(fitter, np.stack([fitter.whitened(frame, 0) for frame in frames]), np.log(forces))
         logs, fits = _fitted_law(presses, logs, starts)
         presses = presses.under(logs)
