@@ -213,6 +213,7 @@ def test_a_calibration_with_an_iterative_method_is_kept_in_the_file(name, grid, 
         je.save_reconstructor(loaded.recon, folder / "iterative.npz")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [je.imaging.MeasuredNoise(), je.imaging.CorrelatedNoise()], ids=["std", "cov"])
 def test_noise_is_measured_before_the_presses(noise, grid, folder):
     """Of 1 uV, white, and steps of 1 uV."""

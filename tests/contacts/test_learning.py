@@ -160,8 +160,8 @@ def test_frames_of_which_no_fit_converges_tell_no_error():
         fitted_model_error([lambda error: -error, lambda error: -np.inf], 0.01)
 
 
-def test_kinds_are_those_of_the_settings_of_usual_loads(ready):
-    """A fitter of a texture tells one tip as one."""
+@pytest.mark.slow
+def test_a_fitter_of_a_texture_tells_one_tip_as_one(ready):
     fitter, finder, frames, noise = ready
     rough = prepare_loads(
         fitter.sheet.model, LoadSettings(texture=0.2, model_error=0.01), noise=noise, sigma=fitter.sheet.sigma

@@ -54,6 +54,7 @@ def test_settings_say_what_differs_from_the_usual_ones():
     )
 
 
+@pytest.mark.slow
 def test_near_tips_are_told_apart_where_only_round_ones_touch(ready):
     """A flat or a long tip would explain them; one tip stays one."""
     fitter, finder, _, _ = ready

@@ -31,6 +31,7 @@ def judged(found, count):
         assert verdicts.get("refused", 0) + verdicts.get("said", 0) >= count / KINDS / 4, family
 
 
+@pytest.mark.slow
 def test_some_lies(root):
     judged(campaign(10, 1, root, 600), 10)
 
