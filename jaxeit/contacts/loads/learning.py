@@ -50,6 +50,8 @@ TEXTURES = (0.0, 0.1, 0.2)
 FORCE_ERROR = 0.03
 # Presses that tell loads, at least.
 FEWEST = 6
+# Log of the ratio of probabilities from which a press speaks for a larger model error, which weak ones hardly do.
+SURELY = 2.0
 # Steps of the law under each texture; how often one is halved; largest change of a log in a step, and the one below
 # which steps end.
 STEPS, HALVINGS, MOST_STEP, LEAST_STEP = 4, 2, 0.7, 0.03
@@ -226,5 +228,5 @@ def _model_error(fitter: LoadFitter, y: np.ndarray, fits: list[Fit]) -> tuple[fl
         return search.evidence(LoadKind.ONE, search.fit(LoadKind.ONE, fit.loads[:1, :4], LAST_FALL))
 
     each = [partial(evidence, *one) for one in zip(y, fits, strict=True)]
-    error = fitted_model_error(each, float(fitter.model_error))
+    error = fitted_model_error(each, float(fitter.model_error), SURELY)
     return error, np.array([one(error) for one in each])

@@ -8,15 +8,13 @@ from ...imaging.noise import InverseError
 
 # Model errors that are tried: each is larger than the one before by this factor, from the first at least to the last.
 STEP, FIRST, LAST = 2**0.5, 1e-3, 0.15
-# Log of the ratio of probabilities from which a frame speaks for a larger error: 7 to 1.
-TOLD = 2.0
 # Share of the frames whose model error is no larger than the one that is found.
 SHARE = 0.9
 # Numbers of frames that an error names.
 SHOWN = 10
 
 
-def fitted_model_error(evidences: Sequence[Callable[[float], float]], least: float) -> float:
+def fitted_model_error(evidences: Sequence[Callable[[float], float]], least: float, surely: float = 0.0) -> float:
     """The model error that nine of ten frames stay below.
 
     The model error of a frame is the least one under which the frame is about as probable as under any (empirical
@@ -27,6 +25,7 @@ def fitted_model_error(evidences: Sequence[Callable[[float], float]], least: flo
     Args:
         evidences: log of the probability of each frame under a model error, -inf where no fit converges.
         least: model error that is tried first.
+        surely: log of the ratio of probabilities from which a frame speaks for a larger error.
 
     Raises:
         InverseError: if there is no frame, or fits converge for half of the frames or less.
@@ -34,7 +33,7 @@ def fitted_model_error(evidences: Sequence[Callable[[float], float]], least: flo
     least = max(least, FIRST)
     last = max(0, int(np.ceil(np.log(LAST / least) / np.log(STEP))))
     tried = least * STEP ** np.arange(last + 1)
-    found = [_told(evidence, tried) for evidence in evidences]
+    found = [_told(evidence, tried, surely) for evidence in evidences]
     fitted = [k for k in found if k is not None]
     if 2 * len(fitted) <= len(found):
         failed = [number for number, k in enumerate(found) if k is None]
@@ -45,8 +44,8 @@ def fitted_model_error(evidences: Sequence[Callable[[float], float]], least: flo
     return float(tried[int(np.quantile(fitted, SHARE, method="higher"))])
 
 
-def _told(evidence: Callable[[float], float], tried: np.ndarray) -> int | None:
-    """The first of the errors under which a frame is as probable as under any but for `TOLD`. None: no fit converges.
+def _told(evidence: Callable[[float], float], tried: np.ndarray, surely: float) -> int | None:
+    """The first of the errors under which a frame is as probable as under any, for sure. None: no fit converges.
 
     The evidence falls from its largest on.
     """
@@ -56,4 +55,4 @@ def _told(evidence: Callable[[float], float], tried: np.ndarray) -> int | None:
         if found[-1] < found[-2]:
             break
     most = max(found)
-    return int(np.argmax(np.array(found[1:]) > most - TOLD)) if most > -np.inf else None
+    return int(np.argmax(np.array(found[1:]) >= most - surely)) if most > -np.inf else None
