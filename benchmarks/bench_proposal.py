@@ -29,18 +29,16 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from scipy.stats import norm
 
 import jaxeit as je
-from calib.calibration.localisation.ellipses import INSIDE_90
 from jaxeit.contacts import LoadFitter, LoadKind, Loads, Proposal
 
-from .bench_loads import Touch, reliability, touches
+from .bench_loads import Touch, held, reliability, touches
 from .clock import seconds
 from .harness import Question, Run
 from .problems import Pressed, fit_model, matched
 from .rows import Row, grouped, rounded
-from .second_simulator import FORCES, TIPS, Press, Wear, described, recorded as pressed
+from .second_simulator import Press, Wear, alike, described, presses as single_tips, recorded as pressed
 
 NAMES = ("one", "two, 1:1, 20 mm", "two, 1:1, 30 mm", "edge, 40 mm", "edge, 60 mm", "three")
 SHIPPED = ("testbed", "chest")
@@ -48,7 +46,7 @@ TIP = 0.012  # m
 FIRST_SEED = 4300
 DEAD = 7  # electrode
 FITS, TAUGHT, NETWORK, BOTH, BOTH_TAUGHT = "fits", "fits, taught", "network", "both", "both, taught"
-PRESSES, PRESS_TIP, MARGIN = 16, 0.02, 0.1  # that teach; m; of the sheet, beside which they lie
+PRESSES, PRESS_TIP = 16, 0.02  # that teach; m
 
 
 def recorded(name: str, seed: int, given: list[Touch], misplaced: float = 0.0) -> Pressed:
@@ -133,7 +131,7 @@ def _seen(
 ) -> tuple[Iterator[np.ndarray], Ready]:
     """Noisy frames of a skin under presses, and what tells them after some further presses."""
     own = np.random.default_rng([seed, 1])
-    lessons, model = teaching(name, presses, own), fit_model(name)
+    lessons, model = alike(own, presses, PRESS_TIP, name), fit_model(name)
     both = pressed(seed, [*given, *lessons], Wear(), name)
     known = {"noise": both.std, "sigma": je.fit_background(model, both.blank(rng))}
     noisy = both.change[len(given) :] + both.noise * own.normal(size=(presses, both.change.shape[1]))
@@ -146,13 +144,6 @@ def _seen(
     ready = Ready(je.contacts.load_proposal(name), fitter, taught, je.prepare_contacts(model, **known))
     changes = both.change[: len(given)]
     return (change + both.noise * rng.normal(size=change.size) for change in changes), ready
-
-
-def teaching(name: str, count: int, rng: np.random.Generator) -> list[Press]:
-    """Presses on a skin of a name, whose places and forces are known."""
-    places = described(name).size * rng.uniform(MARGIN, 1 - MARGIN, (count, 1, 2))
-    each = zip(places, rng.uniform(*FORCES, (count, 1)), strict=True)
-    return [Press(place, force, PRESS_TIP) for place, force in each]
 
 
 def _answers(frame: np.ndarray, ready: Ready) -> Iterator[tuple[str, Answer]]:
@@ -179,10 +170,7 @@ def alone(run: Run) -> Iterator[Row]:
         every = []
         for seed in range(FIRST_SEED + 80, FIRST_SEED + 80 + skins):
             rng = np.random.default_rng(seed)
-            given = [
-                one._replace(tip=tip)
-                for one, tip in zip(teaching(name, count, rng), rng.uniform(*TIPS, count), strict=True)
-            ]
+            given = single_tips(rng, count, name=name)
             frames, ready = _seen(name, seed, given, PRESSES, rng)
             for press, frame in zip(given, frames, strict=True):
                 every += [{"way": way} | _missed(press, ready.searched(frame, way == TAUGHT)) for way in (FITS, TAUGHT)]
@@ -199,14 +187,13 @@ def alone(run: Run) -> Iterator[Row]:
 
 def _missed(press: Press, found: Loads) -> Row:
     """By how much the best single load misses a press, and whether its 90 % ellipse and interval hold."""
-    one, covariance = found.one, np.asarray(found.one.covariance)
-    away = np.asarray(one.position[0]) - press.places[0]
-    log_off = float(np.log(one.force[0] / press.forces[0]))
+    (place,), (force,), _ = press
+    hit = held(found.one, place, force)
     return {
-        "place_mm": 1e3 * float(np.linalg.norm(away)),
-        "force": abs(float(np.expm1(log_off))),
-        "place_covered": bool(away @ np.linalg.solve(covariance[:2, :2], away) < INSIDE_90**2),
-        "force_covered": abs(log_off) < norm.ppf(0.95) * np.sqrt(covariance[3, 3]),
+        "place_mm": hit["error_mm"],
+        "force": abs(float(found.one.force[0]) / force - 1),
+        "place_covered": hit["place"],
+        "force_covered": hit["force"],
         "several": found.kind in (LoadKind.TWO, LoadKind.MORE),
     }
 
@@ -254,18 +241,21 @@ def _stated(name: str, every: list[Row]) -> list[Row]:
 def _means(every: list[Row]) -> Iterator[Row]:
     for way, of_way in grouped(every, "way").items():
         for name, mine in grouped(of_way, "name").items():
-            means = {key: float(np.mean([row[key] for row in mine])) for key in ("told", "several", "surprise")}
-            means["error_mm"] = float(np.median([row["error_mm"] for row in mine]))
-            yield {"touch": name, "way": way, "frames": len(mine)} | rounded(means)
+            yield {"touch": name, "way": way} | _summary(mine, "told", "several", "surprise")
 
 
 def _whole(every: list[Row]) -> Iterator[Row]:
     """Means over all touches, and how many single tips were called several."""
     for way, mine in grouped(every, "way").items():
-        means = {key: float(np.mean([row[key] for row in mine])) for key in ("told", "surprise")}
-        means["false_several"] = float(np.mean([row["several"] for row in mine if row["name"] == NAMES[0]]))
-        means["error_mm"] = float(np.median([row["error_mm"] for row in mine]))
-        yield {"way": way, "frames": len(mine)} | rounded(means)
+        false = float(np.mean([row["several"] for row in mine if row["name"] == NAMES[0]]))
+        yield {"way": way} | _summary(mine, "told", "surprise") | rounded({"false_several": false})
+
+
+def _summary(mine: list[Row], *names: str) -> Row:
+    """The number of frames, means under some names, and the median error of place."""
+    means = {name: float(np.mean([row[name] for row in mine])) for name in names}
+    means["error_mm"] = float(np.median([row["error_mm"] for row in mine]))
+    return {"frames": len(mine)} | rounded(means)
 
 
 def stated(run: Run) -> Iterator[Row]:

@@ -21,6 +21,7 @@ from .problems import Pressed
 SCATTER, SPACING = 0.1, 3e-3  # of the log of the protrusions; of the mesh, m
 FORCES, TIPS = (4.0, 25.0), (0.006, 0.03)  # N, m
 DISTANCE = 0.03  # m, of two contacts
+MARGIN = 0.1  # of the sheet, on which no single tip is
 AGED, AGED_FIELD = -0.3, 0.2  # change of the log gain from the first press to the last: its mean, standard deviation
 LOOSE, LOOSE_AFTER, LOOSENED = 12, 2 / 3, 10.0  # bolt, part of the presses, and factor of its contact resistance
 SUB = 5  # points along each side of a pixel at which the true stress is taken
@@ -59,14 +60,16 @@ def described(name: str) -> Skin:
     return read_skin(SKINS / f"{name}.toml")
 
 
-def presses(rng: np.random.Generator, count: int, tip: float | None = None) -> list[Press]:
-    """Single tips anywhere."""
-    return [
-        Press(place[None], force[None], tip or size)
-        for place, force, size in zip(
-            rng.uniform(0.02, 0.18, (count, 2)), rng.uniform(*FORCES, count), rng.uniform(*TIPS, count), strict=True
-        )
-    ]
+def presses(rng: np.random.Generator, count: int, tip: float | None = None, name: str = "testbed") -> list[Press]:
+    """Single tips anywhere on a skin of a name."""
+    made = alike(rng, count, 0.0, name)
+    return [one._replace(tip=tip or size) for one, size in zip(made, rng.uniform(*TIPS, count), strict=True)]
+
+
+def alike(rng: np.random.Generator, count: int, tip: float, name: str) -> list[Press]:
+    """Single tips of one diameter, m, anywhere on a skin of a name but for its margin."""
+    places = described(name).size * rng.uniform(MARGIN, 1 - MARGIN, (count, 1, 2))
+    return [Press(place, force, tip) for place, force in zip(places, rng.uniform(*FORCES, (count, 1)), strict=True)]
 
 
 def pairs(rng: np.random.Generator, count: int) -> list[Press]:

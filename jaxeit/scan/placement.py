@@ -216,6 +216,9 @@ class _Search:
         def shift(u: np.ndarray) -> np.ndarray:
             return np.asarray(size * (self.mirror @ u).reshape(-1, 2))
 
+        def slack(u: np.ndarray) -> np.ndarray:
+            return _slack(self.skin, self.limits, self.home, here + shift(u)) / size
+
         def fall(u: np.ndarray) -> tuple[float, np.ndarray]:
             value, slope = objective(jnp.asarray(shift(u), objective.model.dtype))
             by_u = size * self.mirror.T @ np.asarray(slope, float).ravel()
@@ -227,16 +230,16 @@ class _Search:
             jac=True,
             method="SLSQP",
             bounds=[(-1.0, 1.0)] * here.size,
-            constraints={"type": "ineq", "fun": lambda u: self._slack(here + shift(u)) / size},
+            constraints={
+                "type": "ineq",
+                "fun": lambda u: _slack(self.skin, self.limits, self.home, here + shift(u)) / size,
+            },
             options={"maxiter": ITERATIONS, "ftol": TOLERANCE},
         )
         skin = with_positions(self.skin, here + shift(found.x))
         model = discretise(Scene(skin), self.fidelity)
         there = replace(objective, model=model, motion=electrode_motion(model))
         return replace(self, skin=skin, objective=there, value=_value(there))
-
-    def _slack(self, places: np.ndarray) -> np.ndarray:
-        return _slack(self.skin, self.limits, self.home, places)
 
 
 def _slack(skin: Skin, limits: PlacementLimits, home: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -16,13 +16,10 @@ few millimetres: its standard deviation, the texture, is the one under which all
 What is left even so is the model error (`fitted_model_error`).
 """
 
-import math
 from dataclasses import replace
-from functools import partial
-from typing import NamedTuple
+from functools import cache, partial
+from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -30,16 +27,16 @@ from jaxtyping import Array, Bool, Float
 from scipy.linalg import solve_triangular
 
 from ..._compile import require_known
-from ...effects.material import ContactPiezoresistance
 from ...imaging.noise import InverseError
 from ...model.discretisation import Model
 from .comparison import LAST_FALL, Comparison, Fit, improbability, padded
 from .fitter import LoadFitter
 from .model_error import fitted_model_error
-from .preparation import AbstractGain, prepare_loads
+from .preparation import AbstractGain, prepare_loads, texture_modes
 from .programs import Problem, before
 from .result import LoadKind
 from .settings import LoadSettings
+from .sheet import scaled_law
 
 # Standard deviations of the logs of amplitude, half pressure and exponent before any press. Amplitude and half pressure
 # of a layer are hardly known; with larger exponents fits of weak or long loads seldom find their end.
@@ -97,21 +94,21 @@ def learn_loads(
     frames, places, forces = (np.asarray(values, float) for values in (dv, position, force))
     _require_presses(frames, places, forces)
     usual = settings or LoadSettings()
-    prepare = partial(prepare_loads, model, noise=noise, untouched=untouched, sigma=sigma, channels=channels, gain=gain)
+    fitter = prepare_loads(model, usual, noise=noise, untouched=untouched, sigma=sigma, channels=channels, gain=gain)
+    presses = _Presses(fitter, np.stack([fitter.whitened(frame, 0) for frame in frames]), np.log(forces))
     learned, best, logs, counted = usual, -np.inf, np.zeros(3), np.ones(len(forces), bool)
     starts = list(np.column_stack([places, np.full(len(forces), np.log(usual.width)), np.log(forces)])[:, None])
     for texture in TEXTURES:
         tried = replace(usual, texture=texture)
-        fitter = prepare(tried)
-        presses = _Presses(fitter, np.stack([fitter.whitened(frame, 0) for frame in frames]), np.log(forces))
-        logs, fits = _fitted_law(presses, logs, starts)
-        presses = presses.under(logs)
-        error, evidences = _model_error(presses.fitter, presses.y, fits)
+        textured = presses.with_texture(tried)
+        logs, fits = _fitted_law(textured, logs, starts)
+        under = textured.under(logs)
+        error, evidences = _model_error(under.fitter, under.y, fits)
         if learned is usual:
             counted = np.isfinite(evidences)  # a press that no load explains tells nothing under any texture
         if not (evidence := float(evidences[counted].sum())) > best:
             break
-        learned, best = replace(tried, law=presses.law, model_error=error), evidence
+        learned, best = replace(tried, law=under.fitter.sheet.law, model_error=error), evidence
         starts = [fit.loads[:1, :4] for fit in fits]
     return learned
 
@@ -150,14 +147,15 @@ class _Presses(NamedTuple):
 
         Where fits of frames begin is not prepared anew: presses begin where they are.
         """
-        parts = [float(part) * math.exp(log) for part, log in zip(jax.tree.leaves(self.law), logs, strict=True)]
-        law = ContactPiezoresistance(*map(jnp.asarray, parts))
-        return self._replace(fitter=eqx.tree_at(lambda fitter: fitter.sheet.law, self.fitter, law))
+        return self._with_sheet(law=scaled_law(self.fitter.sheet.law, logs.tolist()))
 
-    @property
-    def law(self) -> ContactPiezoresistance:
-        """The law of pressure."""
-        return self.fitter.sheet.law
+    def with_texture(self, settings: LoadSettings) -> "_Presses":
+        """The presses on a sheet whose gain has the texture of these settings."""
+        sheet = self.fitter.sheet
+        return self._with_sheet(texture=texture_modes(sheet.points, sheet.weights, settings, sheet.gain.dtype))
+
+    def _with_sheet(self, **parts: Any) -> "_Presses":
+        return self._replace(fitter=replace(self.fitter, sheet=replace(self.fitter.sheet, **parts)))
 
     def search(self, k: int) -> Comparison:
         """The fits of one press, whose force is known."""
@@ -227,6 +225,6 @@ def _model_error(fitter: LoadFitter, y: np.ndarray, fits: list[Fit]) -> tuple[fl
         search = Comparison(under, own, None)
         return search.evidence(LoadKind.ONE, search.fit(LoadKind.ONE, fit.loads[:1, :4], LAST_FALL))
 
-    each = [partial(evidence, *one) for one in zip(y, fits, strict=True)]
+    each = [cache(partial(evidence, *one)) for one in zip(y, fits, strict=True)]
     error = fitted_model_error(each, float(fitter.model_error), SURELY)
     return error, np.array([one(error) for one in each])

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
+from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from ..._compile import full_precision, verb
@@ -103,10 +103,7 @@ def _sheet(
     if known is not None:
         mean, gain, covariance = known.over(centroids)
         about = KnownGain(put(np.exp(mean)), put(covariance))
-    texture, modes = (
-        spread * field_modes(centroids, length) if spread else np.zeros((len(centroids), 0))
-        for spread, length in ((settings.texture, settings.texture_length), (coat, settings.coat_length))
-    )
+    modes = _spread_modes(centroids, coat, settings.coat_length)
     sheet = PressedSheet(
         model=model,
         sigma=sigma,
@@ -116,7 +113,7 @@ def _sheet(
         points=put(points),
         weights=put(weights),
         gain=put(gain),
-        texture=put(texture),
+        texture=texture_modes(points, weights, settings, model.dtype),
         coat=put(modes),
         by_coat=put(np.zeros((len(factor), modes.shape[1]))),
         shape=put(settings.shape),
@@ -125,6 +122,19 @@ def _sheet(
         known=about,
     )
     return _without_loads(sheet)
+
+
+def texture_modes(
+    points: Float[ArrayLike, "elements q 2"], weights: Float[ArrayLike, " q"], settings: LoadSettings, dtype: DTypeLike
+) -> Float[Array, "elements t"]:
+    """Modes of the texture of the gain on elements of these points and weights; none where there is no texture."""
+    centroids = np.einsum("q,eqd->ed", np.asarray(weights, float), np.asarray(points, float))
+    return jnp.asarray(_spread_modes(centroids, settings.texture, settings.texture_length), dtype)
+
+
+def _spread_modes(points: Float[np.ndarray, "n 2"], spread: float, length: float) -> Float[np.ndarray, "n g"]:
+    """Modes of a Gaussian field of a standard deviation at points; none for zero."""
+    return spread * field_modes(points, length) if spread else np.zeros((len(points), 0))
 
 
 @verb

@@ -5,6 +5,7 @@ times changes of the conductivity. These vanish away from the loads, so that the
 suffice: a slope that is off by a thousandth slows a fit down and does not move its end.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -203,8 +204,11 @@ def _reached(by_gain: Float[Array, " e"], modes: Float[Array, "e g"]) -> tuple[F
     return by_gain[:, None] * modes[:, there], there
 
 
-def scaled_law(law: ContactPiezoresistance, logs: Float[Array, "3"]) -> ContactPiezoresistance:
-    """A law whose amplitude, half pressure and exponent are those of another times exp of these logs."""
+def scaled_law(law: ContactPiezoresistance, logs: Float[Array, "3"] | Sequence[float]) -> ContactPiezoresistance:
+    """A law whose amplitude, half pressure and exponent are those of another times exp of these logs.
+
+    Of logs that are Python's floats, the law stays in whatever precision it is used with.
+    """
     parts, structure = jax.tree.flatten(law)
     scaled: ContactPiezoresistance = jax.tree.unflatten(
         structure, [part * jnp.exp(log) for part, log in zip(parts, logs, strict=True)]
