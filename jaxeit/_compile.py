@@ -21,7 +21,7 @@ from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array, Bool
 from threadpoolctl import threadpool_limits
 
-from .program_cache import changes_of_folder, keep, programs_folder
+from .program_cache import changes_of_folder, keep, programs_folder, unbound
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
@@ -60,7 +60,8 @@ def verb(function: F) -> F:
         if _is_transformed(args, kwargs):
             return inner(*args, **kwargs)
         with _plain_precision():
-            return outer(changes_of_folder())(*args, **kwargs)
+            found = outer(changes_of_folder())(*args, **kwargs)
+        return found if programs_folder() is None else unbound(found)
 
     return call  # type: ignore[return-value]
 
@@ -111,7 +112,7 @@ def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | N
     if programs_folder() is None:
         return lambda *rest: program(packs, rest)
     kept = _bound(function, structure, layout, typed, form, flags, changes_of_folder())
-    return lambda *rest: (program if _is_transformed(rest) else kept)(packs, rest)
+    return lambda *rest: program(packs, rest) if _is_transformed(rest) else unbound(kept(packs, rest))
 
 
 @lru_cache(maxsize=256)

@@ -104,6 +104,27 @@ def keep(function: Callable[..., Any], known: Callable[..., Any]) -> Callable[..
     return call
 
 
+def unbound(result: Any) -> Any:
+    """A result whose arrays are bound to no device, as those of a program that was traced.
+
+    JAX 0.10 binds what an exported program returns to the device that it ran on, and compiles every program anew for
+    arrays that are bound.
+    """
+    return jax.tree.map(lambda leaf: _unbound(leaf) if _is_bound(leaf) else leaf, result)
+
+
+def _is_bound(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array) and not isinstance(leaf, jax.core.Tracer) and leaf.committed
+
+
+def _unbound(array: Any) -> Any:
+    """The same numbers, not copied. `jax.device_put` of the host's view would lose the weak type."""
+    try:
+        return type(array)(array.aval, array.sharding, [array], committed=False, _skip_checks=True)
+    except (AttributeError, TypeError):  # a JAX that makes arrays in another way: programs may be compiled twice
+        return array
+
+
 class _Array(Enum):
     """Stands for an array in the arguments or the result of a program."""
 

@@ -13,11 +13,13 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import pytest
+from jax import monitoring
 
 import jaxeit as je
 from jaxeit import program_cache
 
 TRACED: list[str] = []
+COMPILED = "/jax/core/compile/backend_compile_duration"
 
 
 class Layer(eqx.Module):
@@ -136,6 +138,30 @@ def test_results_are_weakly_typed_as_without_a_cache(new_process):
             (other[..., None] + narrow).dtype,
         )
     assert [one.weak_type for one in found] == [False, True, True]
+
+
+def test_a_verb_is_compiled_once_for_arrays_of_any_origin(new_process):
+    """Of the host, and of programs that were traced, kept and found."""
+    layer, compiled = Layer(jnp.arange(3.0), "coat"), []
+
+    def listen(name, seconds, **about):
+        if name == COMPILED:
+            compiled.append(about.get("fun_name"))
+
+    monitoring.register_event_duration_secs_listener(listen)
+    try:
+        kept, _ = scaled(layer)
+        bound, _ = je.bind(scaled, layer)(jnp.asarray(2.0))
+        scaled(kept)
+        scaled(bound)
+        new_process()
+        found, _ = scaled(layer)
+        compiled.clear()
+        scaled(found)
+    finally:
+        monitoring.unregister_event_duration_listener(listen)
+    assert compiled == []
+    assert not any(one.gain.committed for one in (kept, bound, found))
 
 
 def test_results_fit_together_with_results_that_were_traced(new_process, tmp_path):

@@ -172,6 +172,7 @@ def unmoved_forces(law: ForceLaw, pressures: Float[Array, "n pads"], places: Pla
 _LOADED_MULTIPLE = 3.0  # of the noise without force: noise rarely exceeds it, so that idle pads stay idle
 
 
+@je.verb
 def is_loaded(law: ForceLaw, pressures: Float[Array, "n pads"]) -> Bool[Array, "n pads"]:
     """Whether the force on a pad, without correction by location, exceeds the noise of an idle pad; pure."""
     force = replace(law.pads, field=None).forces(pressures).force

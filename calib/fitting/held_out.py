@@ -279,7 +279,7 @@ def _by_other_pads(
 
     def filled(pads: jax.Array, one: jax.Array) -> np.ndarray:
         every = np.array(pads)
-        every[empty] = one[0]
+        every[empty] = np.asarray(one)[0]
         return every
 
     curves = jax.device_put(jax.tree.map(filled, found.curves, together))

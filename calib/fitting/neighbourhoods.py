@@ -15,7 +15,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 
 from .curves.base import AbstractCurve
 from .fields.base import AbstractField
-from .fields.fitted import FittedField, pad_features
+from .fields.fitted import FittedField, centred_features
 from .fields.places import Places
 from .held_out import Folds, HeldOut, joined
 from .intervals import NORMAL_MULTIPLE, NoiseLaw, most_likely_sizes
@@ -36,9 +36,7 @@ def field_neighbourhoods(fitted: FittedField, places: Places, share: np.ndarray)
         places: of the presses.
         share: of each pad in a press, (presses, pads).
     """
-    features = pad_features(fitted.field, fitted.geometry, places, fitted.reach)
-    centred = jnp.where(jnp.isfinite(features), features - fitted.centre, 0)
-    rows = np.einsum("np,npm->nm", np.nan_to_num(share), np.asarray(centred, float))
+    rows = np.einsum("np,npm->nm", np.nan_to_num(share), np.asarray(centred_features(fitted, places), float))
     shapes = np.tile(fitted.field.shapes(), (1, 1 if fitted.field.shared else fitted.geometry.pads))
     rows = rows * np.sqrt(shapes.mean(0))
     length = np.linalg.norm(rows, axis=1, keepdims=True)

@@ -133,7 +133,7 @@ class PadModel(eqx.Module):
         floor = self._noise.floor * self._noise.scale
         if self.sensor is None:
             return floor
-        level, noisy = self._continued(jnp.stack([jnp.zeros_like(self.sensor), self.sensor]), None, None).force
+        level, noisy = predict(self, jnp.stack([jnp.zeros_like(self.sensor), self.sensor])).force
         return jnp.hypot(floor, noisy - level)
 
     def predict(self, own: Float[Array, "n pads"], places: Places | None = None) -> Prediction:
@@ -266,7 +266,7 @@ def fit_pads(
 
 def _carried(curves: FittedCurve, data: PressData, gain: np.ndarray) -> np.ndarray:
     """Force on each pad at all samples, (pads, n) N: the measured force less that of the other pads by their curves."""
-    each = np.nan_to_num(np.asarray(_curve_forces(curves, jnp.asarray(data.sample_pressure))))
+    each = np.nan_to_num(np.asarray(_curve_forces(curves, jax.device_put(data.sample_pressure))))
     each *= np.exp(gain[data.sample_press].T)
     return np.asarray(data.sample_force - (each.sum(0) - each))
 
@@ -293,7 +293,7 @@ def _field(
 ) -> FittedField:
     """The field fitted to log forces over those of the curves, which were fitted with the log-gain `gain`."""
     data = presses.data
-    force = np.asarray(_curve_forces(curves, jnp.asarray(data.pressure.T))).T * np.exp(gain)
+    force = np.asarray(_curve_forces(curves, jax.device_put(data.pressure.T))).T * np.exp(gain)
     part = np.maximum(np.nan_to_num(force), 0)
     total = part.sum(1)
     use = use & (total > 0) & (data.force > 0)
@@ -302,9 +302,9 @@ def _field(
     weight = np.where(use, _weights(data.force, data.place, use), 0)
     extra = bucket(len(use)) - len(use)  # presses without weight, so that compiled fits are reused
     rows = [np.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)) for a in (log_ratio, share, weight)]
-    wide = jax.tree.map(lambda a: jnp.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)), presses.of(field))
-    y, x, w = map(jnp.asarray, rows)
-    return _fit_field(field, presses.geometry, wide, y, x, w, jnp.asarray(data.reach))
+    wide = jax.tree.map(lambda a: np.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)), presses.of(field))
+    y, x, w = map(jax.device_put, rows)
+    return _fit_field(field, presses.geometry, wide, y, x, w, jax.device_put(data.reach))
 
 
 def _weights(force: np.ndarray, place: np.ndarray, use: np.ndarray) -> np.ndarray:
@@ -323,7 +323,7 @@ class PadForces(NamedTuple):
 
 def over_holds(model: PadModel, presses: LocatedPresses) -> PadForces:
     """Pad forces over the holds of the presses, (presses, pads)."""
-    found = predict(model, jnp.asarray(presses.data.pressure), presses.places)
+    found = predict(model, jax.device_put(presses.data.pressure), presses.places)
     good = np.asarray(model.curves.result) == FitResult.SUCCESS
     return PadForces(np.where(good, found.force, np.nan), np.asarray(found.standard_error))
 
@@ -331,12 +331,14 @@ def over_holds(model: PadModel, presses: LocatedPresses) -> PadForces:
 def along_presses(model: PadModel, presses: LocatedPresses) -> PadForces:
     """Pad forces at all samples of the presses, (n, pads)."""
     data = presses.data
-    force, error, _ = (np.asarray(part).T for part in predict_curves(model.curves, jnp.asarray(data.sample_pressure)))
+    found = predict_curves(model.curves, jax.device_put(data.sample_pressure))
+    force, error = np.asarray(found.force).T, np.asarray(found.standard_error).T
     force = np.where(np.asarray(model.curves.result) == FitResult.SUCCESS, force, np.nan)
     if model.field is None or presses.places is None:
         return PadForces(force, error)
     gain = log_gain(model.field, presses.places)
-    factor, variance = (np.asarray(part)[data.sample_press] for part in (jnp.exp(gain.mean), gain.variance))
+    mean, variance = (np.asarray(part)[data.sample_press] for part in gain)
+    factor = np.exp(mean)
     return PadForces(force * factor, factor * np.sqrt(error**2 + force**2 * variance))
 
 

@@ -117,8 +117,8 @@ def _baseline(choice: Choice) -> tuple[AbstractCurve, AbstractField | None]:
 
 def _require_fits(skin: je.Skin, model: PadModel) -> None:
     curves = model.curves
-    for number, pad in enumerate(skin.pads):
-        if int(curves.result[number]) != FitResult.SUCCESS:
+    for number, (pad, result) in enumerate(zip(skin.pads, np.asarray(curves.result), strict=True)):
+        if result != FitResult.SUCCESS:
             raise FitError(f"pad {number} ({pad.name}): the curve could not be fitted: {curves.pad(number).message()}")
     if model.field is not None and int(model.field.result) != FitResult.SUCCESS:
         raise FitError(

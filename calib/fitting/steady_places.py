@@ -10,7 +10,10 @@ Nonlinear Models, ch. 4).
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+import jaxeit as je
 
 from .fields import Geometry, Places
 from .fields.base import cubic_bspline
@@ -57,7 +60,7 @@ def _average(
     geometry: Geometry, stage: np.ndarray, image: np.ndarray, use: Bool[np.ndarray, " presses"]
 ) -> tuple[np.ndarray, float]:
     """Average places (presses, 2) of images, and the scatter of a coordinate of single images about them, m."""
-    features, near = _inward(geometry, np.where(use[:, None], stage, 0)), use
+    features, near = np.asarray(_inward(geometry, np.where(use[:, None], stage, 0))), use
     error = np.where(use[:, None], image - stage, 0)
     for _ in range(ROUNDS):
         coefficients = np.linalg.lstsq(features[near].reshape(-1, BUMPS), error[near].ravel(), rcond=None)[0]
@@ -70,16 +73,14 @@ def _average(
     return stage + average, scatter
 
 
-def _inward(geometry: Geometry, place: Float[np.ndarray, "presses 2"]) -> Float[np.ndarray, "presses 2 bumps"]:
+@je.verb
+def _inward(geometry: Geometry, place: Float[ArrayLike, "presses 2"]) -> Float[Array, "presses 2 bumps"]:
     """Bumps of the distance to each of the two nearest sides of the rim, times the direction away from the side."""
-    here = jnp.asarray(place, geometry.rim.dtype)
-    on_rim = nearest_points(here, geometry.rim[:, 0], geometry.rim[:, 1])
-    metres = np.asarray(distance(on_rim, here[:, None]))
-    two = np.argsort(metres, 1)[:, :2]
-    metres = np.take_along_axis(metres, two, 1)
-    away = place[:, None] - np.take_along_axis(np.asarray(on_rim), two[..., None], 1)
-    away = away / np.where(metres > 0, metres, 1)[..., None]
-    octaves = np.log2(1 + metres / RIM_WIDTH)
-    bumps = np.asarray(cubic_bspline(jnp.asarray(octaves[..., None] - np.arange(BUMPS))))
-    found: np.ndarray = np.einsum("psd,psb->pdb", away, bumps)
-    return found
+    here = jnp.asarray(place, geometry.rim.dtype)[:, None]
+    on_rim = nearest_points(here[:, 0], geometry.rim[:, 0], geometry.rim[:, 1])
+    two = jnp.argsort(distance(on_rim, here), 1)[:, :2]
+    near = jnp.take_along_axis(on_rim, two[..., None], 1)
+    metres = distance(near, here)[..., None]
+    away = (here - near) / jnp.where(metres > 0, metres, 1)
+    bumps = cubic_bspline(jnp.log2(1 + metres / RIM_WIDTH) - jnp.arange(BUMPS, dtype=here.dtype))
+    return jnp.einsum("psd,psb->pdb", away, bumps)

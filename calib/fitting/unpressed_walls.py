@@ -7,7 +7,9 @@ from the walls, forces 14 to 18 mm from a wall were 5 to 11 % too large, and 90 
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
+
+import jaxeit as je
 
 from .fields import FittedField, Geometry, PadEdge, PadEdgeSpline, Places
 from .fields.geometry import distance, nearest_points, onto_pads
@@ -44,8 +46,13 @@ def unpressed_note(field: FittedField | None, places: Places | None, share: Floa
 
 def _wall_distances(geometry: Geometry, places: Places, share: Float[np.ndarray, "n pads"]) -> Float[np.ndarray, " m"]:
     """Distance of each press that rests on one pad to the nearest side of that pad, m."""
-    place = onto_pads(geometry, places.position[:, 0])
-    nearest = distance(nearest_points(place, geometry.start, geometry.end), place[..., None, :]).min(-1)
-    own = np.asarray(nearest)[np.nan_to_num(share) >= WHOLE]
+    own = np.asarray(_to_sides(geometry, places.position[:, 0]))[np.nan_to_num(share) >= WHOLE]
     found: np.ndarray = own[np.isfinite(own)]
     return found
+
+
+@je.verb
+def _to_sides(geometry: Geometry, position: Float[Array, "n 2"]) -> Float[Array, "n pads"]:
+    """Distance of each pad's nearest side to the point of the pad that is nearest to a position, m."""
+    place = onto_pads(geometry, position)
+    return distance(nearest_points(place, geometry.start, geometry.end), place[..., None, :]).min(-1)

@@ -190,13 +190,14 @@ def _by_rows(function: Callable[..., Any], *arrays: ArrayLike) -> Any:
     given = [np.asarray(array) for array in arrays]
     starts = range(0, max(len(given[0]), 1), ROWS)
     parts = [function(*(_rows(array, first) for array in given)) for first in starts]
-    return jax.tree.map(lambda *part: jnp.asarray(np.concatenate(part)[: len(given[0])]), *parts)
+    return jax.tree.map(lambda *part: jax.device_put(np.concatenate(part)[: len(given[0])]), *parts)
 
 
 def _rows(values: np.ndarray, first: int) -> Array:
     """`ROWS` rows from `first` on; zeros after the last."""
     some = values[first : first + ROWS]
-    return jnp.asarray(np.concatenate([some, np.zeros((ROWS - len(some), *some.shape[1:]), some.dtype)]))
+    found: Array = jax.device_put(np.concatenate([some, np.zeros((ROWS - len(some), *some.shape[1:]), some.dtype)]))
+    return found
 
 
 # --- as numbers, for the calibration file ----------------------------------------------------------------------------

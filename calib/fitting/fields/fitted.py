@@ -62,14 +62,15 @@ class FittedField(eqx.Module):
         the extrapolated field, plus the square of the difference between the two. `error_scale` widens the errors up to
         those at an unknown place.
         """
-        held, there = (self._centred(places, reach) for reach in (self.reach, None))
+        held, there = (self.centred(places, reach) for reach in (self.reach, None))
         between = (there - held) @ self.coefficients
         variance = jnp.einsum("npi,ij,npj->np", there, self.covariance, there) + between**2
         unknown = jnp.maximum(self.spread**2 - self.noise**2, 0)
         variance = jnp.maximum(variance, jnp.minimum(self.error_scale**2 * variance, unknown))
         return LogGain(held @ self.coefficients, jnp.where(places.known, variance, unknown))
 
-    def _centred(self, places: Places, reach: Float[Array, "pads 2 2"] | None) -> Float[Array, "n pads m"]:
+    def centred(self, places: Places, reach: Float[Array, "pads 2 2"] | None) -> Float[Array, "n pads m"]:
+        """Features less those of the presses, with contacts inside the box `reach`; 0 where the place is not known."""
         features = pad_features(self.field, self.geometry, places, reach)
         return jnp.where(places.known[..., None] & jnp.isfinite(features), features - self.centre, 0)
 
@@ -82,6 +83,12 @@ class FittedField(eqx.Module):
 def log_gain(fitted: FittedField, places: Places) -> LogGain:
     """`FittedField.log_gain`, compiled."""
     return fitted.log_gain(places)
+
+
+@je.verb
+def centred_features(fitted: FittedField, places: Places) -> Float[Array, "n pads m"]:
+    """Features of the field at places inside its reach, less those of the presses, compiled."""
+    return fitted.centred(places, fitted.reach)
 
 
 def pad_features(
