@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.bench_loads import TIP_SPREAD, seen, shaped, simulated
+from benchmarks.bench_loads import TIP_SPREAD, prepared, seen, shaped, simulated
 from benchmarks.problems import fit_model
 
 
@@ -14,6 +14,6 @@ def test_rings_are_found_where_they_are(seed):
     model = fit_model()
     given = list(shaped(np.random.default_rng(seed), "ring", 8))
     found = simulated(seed, given, spread=TIP_SPREAD)
-    for one in seen(model, found, given, seed, 80, True):
+    for one in seen(prepared(model, found, seed, 80, True), given):
         place = np.asarray(one.loads.one.position)
         assert np.linalg.norm(place - one.touch.truth) < 4e-3
