@@ -143,7 +143,7 @@ class StreamReceiver:
             if data:
                 state, frames = self.source.decode(state, data)
                 self.counters.present = state.counts
-                if state.note != self._last_note:
+                if state.note not in ("", self._last_note):  # empty: none since the link was opened
                     self._note_simulation(state.note)
                 if state.pong is not None:
                     self._journal.append(PONG, 0, host, pack_pong(self.number, state.pong))

@@ -41,7 +41,7 @@ from calib.record.plan import STREAM_KINDS, PlanError, RecordingPlan, StreamPlan
 from calib.record.planning import plan_recording
 from calib.record.recorder import StopRequest, record_session
 from calib.record.sources import MAX_READ_BYTES, source_from_url
-from calib.record.wire.encoding import encode_frame
+from calib.record.wire.encoding import encode_frame, encode_note
 from calib.record.wire.messages import Frame, Pong
 from calib.session import SessionError, Status, open_session
 
@@ -590,11 +590,17 @@ READINGS = 928
 POOL = np.random.default_rng(0).normal(size=(64, READINGS)).astype("<f4")
 
 
-def endless(name, rate=None):
-    """What a device sends for ever: values known from their numbers, ticks of its own clock."""
+def endless(name, rate=None, about=None):
+    """What a device sends for ever: values known from their numbers, ticks of its own clock; a note ten times a second.
+
+    Args:
+        about: what the notes say; None: no notes.
+    """
     number, rate = STREAM_KINDS[name].number, rate or RATES[name]
     channels = READINGS if name == "eit" else 4
     for seq in count():
+        if about is not None and seq % (rate // 10) == 0:
+            yield int(seq * S / rate), encode_note(number, about)
         yield int(seq * S / rate), encode_frame(number, seq, seq * 1_000_000 // rate, POOL[seq % 64, :channels])
 
 
@@ -927,10 +933,11 @@ def test_an_earlier_recording_is_not_lost_to_a_new_one(device, tmp_path, capsys)
     assert "-o" in capsys.readouterr().err
 
 
-def test_streams_that_come_and_go_are_recorded_with_their_gaps(tmp_path):
+@pytest.mark.parametrize("about", [None, {"simulated": True, "seed": 3}], ids=["silent", "notes"])
+def test_streams_that_come_and_go_are_recorded_with_their_gaps(tmp_path, about):
     plan, sources = plan_recording({"pressure": "tcp://127.0.0.1:1?channels=4"}, None)
     orders, folder = StopRequest(), tmp_path / "s.h5"
-    with SimulatedDevice([endless("pressure", 500)]) as device:
+    with SimulatedDevice([endless("pressure", 500, about)]) as device:
         sources = [source_from_url("pressure", device.urls[0], 4)]
         plan = replace(plan, streams=(sources[0].plan,))
 
@@ -958,7 +965,9 @@ def test_streams_that_come_and_go_are_recorded_with_their_gaps(tmp_path):
         assert not (status & Status.clock_step).any()
         true = seq * (S // 500)
         assert np.ptp(stream.time - true) < 20_000_000
-        assert {*session.events.code.tolist()} == {EventCode.CONNECTED, EventCode.LOST, EventCode.FAULT}
+        said = [] if about is None else [EventCode.SIMULATED]
+        assert {*session.events.code.tolist()} == {EventCode.CONNECTED, EventCode.LOST, EventCode.FAULT, *said}
+        assert session.simulated is (about is not None)
         assert not session.complete
         assert "frames were lost; check the link" in summary.render()
 
