@@ -19,6 +19,7 @@ from h5py import h5d, h5p, h5s, h5t
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 import calib.session.archive as archive
+from calib.check import check_session
 from calib.session import (
     ArchiveWriter,
     ClockTable,
@@ -132,11 +133,12 @@ def test_descriptions_come_back(session: Session) -> None:
     assert set(session.streams) == {"eit", "force"}
 
 
-def test_a_stream_of_a_closed_session_says_so(good: Path) -> None:
+def test_a_closed_session_says_so(good: Path) -> None:
     with open_session(good) as opened:
         eit = opened.streams["eit"]
-    with pytest.raises(SessionError, match="is read after its file was closed; read it before, inside the `with`"):
-        eit.read()
+    for read in (eit.read, lambda: opened.presses, lambda: check_session(opened)):
+        with pytest.raises(SessionError, match="is read after its file was closed; read it before, inside the `with`"):
+            read()
 
 
 def test_samples_come_back_with_holes_and_flags(session: Session) -> None:

@@ -112,11 +112,9 @@ class GuardedArray:
 
         `SessionError` if they are more bytes than the budget allows at once.
         """
-        if not self.node.id.valid:
-            raise self.node.error("is read after its file was closed", "read it before, inside the `with` of the file")
         rows = len(range(*slice(start, stop).indices(self.shape[0]))) if self.shape else 1
         self.node.require("array_bytes", rows * self.row_bytes)
-        with translated(self.node.path, self.node.where):
+        with self.node.reads():
             if not self.shape or self.node.id.get_create_plist().get_layout() == h5d.COMPACT:
                 return self._read_compact()[slice(start, stop) if self.shape else ...]
             start, stop, _ = slice(start, stop).indices(self.shape[0])

@@ -165,13 +165,25 @@ class Node:
         """Raise `SessionError` if more is asked for than the budget's limit of that name allows."""
         require_within(self.path, self.where, limit, asked)
 
+    @contextlib.contextmanager
+    def reads(self, where: str = "") -> Iterator[None]:
+        """Turn errors of the library into one `SessionError`, also where the file was closed before.
+
+        Args:
+            where: what is read, if it is a part of the node.
+        """
+        if not self.id.valid:
+            raise self.error("is read after its file was closed", "read it before, inside the `with` of the file")
+        with translated(self.path, where or self.where):
+            yield
+
     def child(self, name: str) -> "Node | None":
         """The member `name`, or None. A name that is a path, and a link to elsewhere, are refused."""
         where = f"{self.where.rstrip('/')}/{name}"
         if not is_member_name(name):
             # The library takes names for paths, and would follow any link on the way.
             raise self.error(f"names the member {printable(name)!r}, which is a path", "give the name of one member")
-        with translated(self.path, where):
+        with self.reads(where):
             if not self.id.links.exists(name.encode()):
                 return None
             kind = self.id.links.get_info(name.encode()).type
@@ -199,7 +211,7 @@ class Node:
 
     def members(self, limit: int = MAX_MEMBERS) -> list[str]:
         """Names of the members, sorted; refused before listing if there are more than `limit`."""
-        with translated(self.path, self.where):
+        with self.reads():
             count = self.id.get_num_objs()
             if count > limit:
                 what = f"has {count:,} members, the limit is {limit:,}"
@@ -210,7 +222,7 @@ class Node:
 
     def attribute_names(self) -> list[str]:
         """Names of the attributes, sorted; refused if there are more than `MAX_ATTRIBUTES`."""
-        with translated(self.path, self.where):
+        with self.reads():
             count = h5a.get_num_attrs(self.id)
             if count > MAX_ATTRIBUTES:
                 what = f"has {count:,} attributes, the limit is {MAX_ATTRIBUTES}"
@@ -220,7 +232,7 @@ class Node:
 
     def attribute(self, name: str) -> str | int | float | np.ndarray | None:
         """Value of an attribute, or None if it is missing; `SessionError` for types that are not plain."""
-        with translated(self.path, f"{self.where}@{name}"):
+        with self.reads(f"{self.where}@{name}"):
             if not h5a.exists(self.id, name.encode()):
                 return None
             return _attribute_value(self, name, h5a.open(self.id, name.encode()))
