@@ -20,7 +20,7 @@ import jaxeit as je
 
 ROOT = Path(__file__).parents[1]
 ORDER = [
-    "spelling", "_missing_names", "budget", "files", "array_files", "notebook", "program_cache", "_compile",
+    "spelling", "kinds", "_missing_names", "budget", "files", "array_files", "notebook", "program_cache", "_compile",
     "toml", "registry", "geometry", "meshing", "linalg", "skin", "effects", "least_squares", "model",
     "imaging", "metrics", "fusion", "contacts", "tracking", "scan", "accuracy", "plot", "__main__",
 ]  # fmt: skip

@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Integral
 from pathlib import Path
 
 import jaxeit as je
+from jaxeit.kinds import require_kind
 from jaxeit.toml import parse_toml, read_text
 
 from ..fitting.curves import AbstractCurve, Linear
@@ -12,7 +14,18 @@ from ..fitting.fields import AbstractField
 from ..fitting.losses import AbstractLoss, SoftL1
 from ..presses.table import Processing
 from .localisation.locators import AbstractLocatorChoice, FittedContact
-from .recipe_text import recipe_fields, recipe_to_toml
+from .recipe_text import SWITCHES, recipe_fields, recipe_to_toml
+
+_KINDS: dict[str, tuple[type, str, str]] = {
+    "curve": (AbstractCurve, "a curve", "calib.PowerLaw()"),
+    "location": (AbstractField, "a field", "calib.PadEdgeSpline()"),
+    "locator": (AbstractLocatorChoice, "a choice of locator", "calib.calibration.FittedContact()"),
+    "loss": (AbstractLoss, "a loss", "calib.fitting.Huber()"),
+    "processing": (Processing, "a processing", "calib.presses.Processing()"),
+    "imaging": (je.Imaging, "an imaging", "je.Imaging(je.Pixels(40))"),
+    "fidelity": (je.Fidelity, "a fidelity", "je.Fidelity.draft()"),
+}
+"""Class of each choice, the noun for it, and an example."""
 
 
 class RecipeError(ValueError):
@@ -49,8 +62,9 @@ class Recipe:
     of curves and locations become tuples.
 
     Raises:
-        RecipeError: if no curve or location is given, if there is less than one fold, if the basis has no pixels, or
-            if the hyperparameter has frames of its own, because the frames of the presses are used to choose it.
+        RecipeError: if a name, a class or an object of another kind stands in the place of a choice, if no curve or
+            location is given, if there is less than one fold, if the basis has no pixels, or if the hyperparameter has
+            frames of its own, because the frames of the presses are used to choose it.
     """
 
     curve: AbstractCurve | Sequence[AbstractCurve] = field(default_factory=Linear)
@@ -68,18 +82,31 @@ class Recipe:
     def __post_init__(self) -> None:
         for name in ("curve", "location"):
             choice = getattr(self, name)
-            if isinstance(choice, Sequence):
+            if isinstance(choice, Sequence) and not isinstance(choice, str):
                 object.__setattr__(self, name, tuple(choice))
                 if not choice:
                     raise RecipeError(f"recipe: {name} is empty; give one or more to choose from")
-        if self.folds < 1:
-            raise RecipeError(f"recipe: folds is {self.folds}; give a whole number above zero")
+        self._require_kinds()
+        if not isinstance(self.folds, Integral) or isinstance(self.folds, bool) or self.folds < 1:
+            raise RecipeError(f"recipe: folds is {self.folds!r}; give a whole number above zero")
         if isinstance(self.imaging.basis, je.model.Elements):
             raise RecipeError("recipe: pads are laid on an image of pixels; choose the basis Pixels or Bumps")
         weight = self.imaging.hyperparameter
         if isinstance(weight, je.imaging.AbstractFrameChoice) and weight.frames is not None:
             name = type(weight).__name__
             raise RecipeError(f"recipe: {name} has frames of its own; give {name}(), which looks at the presses")
+
+    def _require_kinds(self) -> None:
+        """Refuse names, classes and objects of another kind in the place of a choice."""
+        for name, (kind, noun, example) in _KINDS.items():
+            given = getattr(self, name)
+            for choice in given if isinstance(given, tuple) and name in ("curve", "location") else (given,):
+                if choice is not None or name != "location":
+                    give = f"an object, such as {example} (names are for TOML and the command line)"
+                    require_kind(choice, kind, RecipeError, noun, give, f"recipe: {name}")
+        for name in SWITCHES:
+            if not isinstance(getattr(self, name), bool):
+                raise RecipeError(f"recipe: {name} is {getattr(self, name)!r}; give True or False")
 
     @classmethod
     def from_toml(

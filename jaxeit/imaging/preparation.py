@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from .._compile import full_precision, is_traced, verb
+from ..kinds import require_kind
 from ..model.bases import AbstractBasis, BasisMap, Pixels
 from ..model.discretisation import Model, require_model
 from ..model.sensitivity import pair_jacobian
@@ -231,10 +232,7 @@ def require_choices(prior: Any, method: Any, basis: Any, weight: Any) -> None:
         ("method", method, (AbstractLinearMethod, AbstractIterativeMethod), "method=OneStep()"),
         ("basis", basis, (AbstractBasis, BasisMap), "basis=Pixels(40)"),
     ):
-        if not isinstance(choice, kinds):
-            stated = type(choice).__name__ if not isinstance(choice, type) else f"the class {choice.__name__}"
-            stated = repr(choice) if isinstance(choice, str) else stated
-            raise InverseError(f"{stated} is not a {name}; give an object, such as {example}")
+        require_kind(choice, kinds, InverseError, f"a {name}", f"an object, such as {example}")
     if prior.follows_image and not method.follows_prior:
         raise InverseError(
             f"the prior {type(prior).__name__} changes with the image, and the method {type(method).__name__} takes it "

@@ -246,3 +246,27 @@ def test_what_was_cut_one_way_is_evaluated_that_way(grid, folder):
     old = replace(loaded, provenance={k: v for k, v in loaded.provenance.items() if k != "recipe"})
     assert old.processing == calib.presses.Processing()
     assert old.recipe is None
+
+
+@pytest.mark.parametrize(
+    ("choices", "said"),
+    [
+        ({"curve": "power"}, r"curve: 'power' is not a curve; give an object, such as calib.PowerLaw\(\) \(names are"),
+        ({"curve": calib.PowerLaw}, "curve: the class PowerLaw is not a curve"),
+        ({"curve": [calib.Linear(), "power"]}, "curve: 'power' is not a curve"),
+        ({"curve": None}, "curve: NoneType is not a curve"),
+        ({"location": "edge-spline"}, "location: 'edge-spline' is not a field"),
+        ({"locator": "fitted"}, "locator: 'fitted' is not a choice of locator"),
+        ({"loss": "huber"}, "loss: 'huber' is not a loss"),
+        ({"processing": 20.0}, "processing: float is not a processing"),
+        ({"imaging": je.Pixels(20)}, r"imaging: Pixels is not an imaging; give an object, such as je.Imaging\("),
+        ({"fidelity": "draft"}, r"fidelity: 'draft' is not a fidelity; give an object, such as je.Fidelity.draft\(\)"),
+        ({"folds": 2.5}, "folds is 2.5; give a whole number above zero"),
+        ({"folds": "5"}, "folds is '5'; give a whole number above zero"),
+        ({"folds": True}, "folds is True; give a whole number above zero"),
+        ({"even_sheet": "no"}, "even_sheet is 'no'; give True or False"),
+    ],
+)
+def test_what_stands_in_the_place_of_a_choice_is_refused(choices, said):
+    with pytest.raises(RecipeError, match=f"recipe: {said}"):
+        calib.Recipe(**choices)

@@ -1,0 +1,30 @@
+"""One message for what stands in the place of something else: a name, a path, a class, or an object of another kind."""
+
+import os
+from typing import Any
+
+
+def stated(value: Any) -> str:
+    """How a message names a value: a text or path as it is written, a class as such, another object by its class."""
+    if isinstance(value, str | os.PathLike):
+        return repr(os.fspath(value))
+    return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+
+
+def require_kind(
+    value: Any, kinds: type | tuple[type, ...], error: type[Exception], what: str, give: str, where: str = ""
+) -> None:
+    """Refuse a value that is none of some classes.
+
+    Args:
+        kinds: the classes.
+        error: type of the error.
+        what: what the value should be, such as "a prior".
+        give: what the user should give.
+        where: name of the call or of the setting.
+
+    Raises:
+        error: "<where>: <value> is not <what>; give <give>".
+    """
+    if not isinstance(value, kinds):
+        raise error(f"{where}{where and ': '}{stated(value)} is not {what}; give {give}")
