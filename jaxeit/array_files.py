@@ -20,9 +20,15 @@ DAMAGE = (
 )
 
 
-def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays as a NumPy .npz, whole or not at all; equal arrays give equal bytes."""
+def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], error: type[ValueError]) -> None:
+    """Write arrays as a NumPy .npz, whole or not at all; equal arrays give equal bytes.
+
+    Raises:
+        ValueError: of the type given, if a file of another kind is there, which would be lost.
+    """
     path = Path(path)
+    if path.is_file() and path.stat().st_size and not zipfile.is_zipfile(path):
+        raise error(f"{path.name}: holds something else than arrays, which would be lost; give another name")
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
     try:
         with os.fdopen(handle, "wb") as file:

@@ -14,7 +14,7 @@ from ..calibration.logs.procedure import FORCE_FORMAT as LOG_FORCES
 from ..session import ArchiveReader, open_archive
 from ..session.archive import archive_format
 from ..session.errors import printable, problem
-from ..session.hdf5.storage import folder_beside
+from ..session.hdf5.storage import folder_beside, require_no_input, require_no_session
 
 BLOCK = 4096  # rows that are read at once
 CONTACTS = "-contacts.csv"  # end of the name of the second table
@@ -58,13 +58,16 @@ def export_csv(
 
     Args:
         source: a force map, or the forces of a log.
-        output: replaced if it exists; the tables appear when they are complete.
+        output: replaced if it exists and is no session; the tables appear when they are complete.
         progress: wraps what is written piece by piece, as `tqdm.tqdm` does.
 
     Raises:
-        SessionError: for another kind of file, or one that lacks an array.
+        SessionError: for another kind of file, or one that lacks an array; for an output that is the source or a
+            session, which would be lost.
     """
     source, output = Path(source), Path(output)
+    require_no_input(output, [source])
+    require_no_session(output)
     kind = archive_format(source)
     if kind not in (FORCE_MAP, LOG_FORCES):
         what = f"is {printable(kind)!r}" if kind else "has no format"

@@ -260,7 +260,8 @@ def save_reconstructor(recon: Reconstructor, path: str | Path) -> None:
     """Write numbers and provenance to ``path`` (a NumPy .npz), whole or not at all.
 
     Raises:
-        StorageError: for a reconstructor that is not linear, as the file holds a matrix.
+        StorageError: for a reconstructor that is not linear, as the file holds a matrix; where ``path`` is a file of
+            another kind, which would be lost.
     """
     if not isinstance(recon, Reconstructor):
         raise StorageError(
@@ -268,7 +269,7 @@ def save_reconstructor(recon: Reconstructor, path: str | Path) -> None:
             "with a linear method, such as OneStep, or save the calibration that it belongs to"
         )
     about = {"format": FORMAT, "shape": recon.shape, "extent": recon.extent, "provenance": recon.provenance}
-    write_arrays(path, {"about": np.array(json.dumps(about)), **to_numbers(recon)})
+    write_arrays(path, {"about": np.array(json.dumps(about)), **to_numbers(recon)}, StorageError)
 
 
 def load_reconstructor(path: str | Path) -> Reconstructor:

@@ -1,6 +1,7 @@
 """Tables of forces read back are the force maps, to the last bit."""
 
 import csv
+import shutil
 
 import numpy as np
 import pytest
@@ -95,3 +96,14 @@ def test_what_holds_no_forces_is_refused_and_nothing_is_left(tmp_path, capsys):
     assert main(["export", "csv", str(tmp_path / "other.h5"), "-o", str(tmp_path / "other.h5")]) == 2
     assert "other.h5" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bare.h5", "other.h5"]
+
+
+def test_neither_the_force_map_nor_a_session_is_replaced(tmp_path, bundled):
+    archive(tmp_path / "map.h5")
+    session = tmp_path / "session.h5"
+    shutil.copy(bundled[0], session)
+    for output, words in ((tmp_path / "map.h5", "is also an input"), (session, "holds a session")):
+        before = output.read_bytes()
+        with pytest.raises(SessionError, match=f"{output.name}: file: {words}.*, which would be lost; give another"):
+            export_csv(tmp_path / "map.h5", output)
+        assert output.read_bytes() == before

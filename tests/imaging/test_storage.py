@@ -129,6 +129,16 @@ def test_a_picture_that_does_not_hold_the_image_is_refused(recon):
         je.imaging.from_numbers(je.imaging.to_numbers(recon), (3, 3), recon.extent)
 
 
+def test_a_file_of_another_kind_is_not_replaced(recon, tmp_path):
+    path = tmp_path / "session.h5"
+    path.write_bytes(b"\x89HDF a recording")
+    with pytest.raises(je.imaging.StorageError, match=r"session.h5: holds something else than arrays, .* another name"):
+        je.save_reconstructor(recon, path)
+    assert path.read_bytes() == b"\x89HDF a recording"
+    for _ in range(2):  # also in the place of an earlier one
+        je.save_reconstructor(recon, tmp_path / "recon.npz")
+
+
 def test_nothing_is_left_where_nothing_can_be_written(recon, tmp_path):
     (tmp_path / "taken").mkdir()
     with pytest.raises(OSError, match="directory"):

@@ -405,3 +405,12 @@ def test_no_other_format_is_taken(capsys):
     with pytest.raises(SystemExit):
         main(["import", "xlsx", "log.xlsx", "-o", "s.h5"])
     assert "no xlsx; choose from csv, hdf5" in capsys.readouterr().err.replace("'", "")
+
+
+def test_a_table_is_not_replaced_by_the_session_made_of_it(tmp_path):
+    text = "t,f\n0,1.5\n10,2.5\n20,3.5\n"
+    log = table(tmp_path, text)
+    spec = importers.FileSpec(log, time="t", time_unit="ms", streams=(importers.StreamSpec("force", ("f",), "N"),))
+    with pytest.raises(SessionError, match=r"log\.csv: file: is also an input, which would be lost; give another"):
+        import_csv([spec], log)
+    assert log.read_text(encoding="utf-8") == text

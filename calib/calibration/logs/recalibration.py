@@ -68,7 +68,7 @@ def recalibrate_log(
 
     Raises:
         SessionError: if a stream is missing, the sensor is another, the log does not determine the gain, or
-            has moved the calibration before.
+            has moved the calibration before; also with ignored errors, if the sensor does not follow the force.
         RecordingError: if `check_session` finds an error in the session, unless errors are ignored.
 
     Example:
@@ -80,6 +80,12 @@ def recalibrate_log(
     found = assess_log(calibration, session, drift, ignore_errors=ignore_errors)
     if not found.determined and not ignore_errors:
         raise SessionError(f"{session.name}: {found.health}; or move it all the same (--force, ignore_errors=True)")
+    if not found.follows:
+        raise SessionError(
+            f"{session.name}: /streams/{calibration.stream}: does not follow the force: by the calibration it reads "
+            f"{found.gain:.3g} N +- {found.errors[0]:.2g} N per newton; check the sensor, its tube and the order of "
+            "the columns at import, and calibrate again if they are right"
+        )
     history = [calibration.provenance.get("recalibrations", ""), found.summary()]
     return replace(
         calibration,

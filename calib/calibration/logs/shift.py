@@ -20,6 +20,7 @@ from ...fitting.logs import LogModel, LogPrediction
 from ..recalibration.changes import LARGE_MISFIT, NOTICEABLE, SIGNIFICANT, Advice, days_between, health_line
 
 MIN_BLOCKS = 5  # of time, with which a standard error over them means something
+MIN_GAIN = 0.1  # of what the sensor read before; a sensor below it does not follow the force, or has another unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +62,17 @@ class LogShift:
         return gain, offset
 
     @property
+    def follows(self) -> bool:
+        """Whether the sensor still follows the force, so that a gain can be taken off."""
+        return self.gain >= MIN_GAIN * float(self.before[0])
+
+    @property
     def advice(self) -> Advice:
         """What to do about the calibration as it was before this recalibration."""
         if not self.determined:
             return Advice.UNKNOWN_LOG
+        if not self.follows:
+            return Advice.CALIBRATE_LOG
         if self.misfit > LARGE_MISFIT and not self.scatter <= NOTICEABLE * self.full_scale:  # NaN: early files
             return Advice.CALIBRATE_LOG
         change = np.abs([self.gain / self.before[0] - 1, (self.offset - self.before[1]) / self.full_scale])

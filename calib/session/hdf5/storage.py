@@ -18,7 +18,7 @@ import stat
 import tempfile
 import uuid
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -93,6 +93,17 @@ def require_no_session(path: Path, *, simulated_too: bool = True, imported_too: 
         if (simulated_too or not np.any(simulated)) and (imported_too or not imported):
             what = "session" if simulated_too else "recording"
             raise problem(path, "file", f"holds a {what}, which would be lost", "give another name")
+
+
+def require_no_input(path: Path, inputs: Iterable[Path]) -> None:
+    """Refuse an output that is also one of the inputs.
+
+    Raises:
+        SessionError: naming the file.
+    """
+    for other in inputs:
+        if path.exists() and other.exists() and path.samefile(other):
+            raise problem(path, "file", "is also an input, which would be lost", "give another name")
 
 
 @contextlib.contextmanager

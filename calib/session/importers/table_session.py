@@ -16,7 +16,7 @@ import numpy as np
 
 from ..errors import SessionError, printable, problem
 from ..facts import SessionFacts, StreamFacts
-from ..hdf5.storage import IMPORT, file_hash, require_no_session
+from ..hdf5.storage import IMPORT, file_hash, require_no_input, require_no_session
 from ..tables import Status
 from ..units import KNOWN_UNITS, UNITS, VARIABLE_UNIT, wrong_quantity
 from ..writer import SessionWriter, program
@@ -79,7 +79,8 @@ def import_tables(
         sort: allow rows that go back in time.
 
     The same files and options give the same bytes. An imported session at ``output`` is replaced. Raises
-    `SessionError` for what cannot be read or understood and for a recording at ``output``, and then writes nothing.
+    `SessionError` for what cannot be read or understood and for a recording or an input at ``output``, and then writes
+    nothing.
 
     Example:
         streams = (importers.StreamSpec("force", ("load",), "N"),)
@@ -88,6 +89,7 @@ def import_tables(
         report = importers.import_tables(importers.CsvFile, [table], "by_hand.h5", about)  # or your own
     """
     require_no_session(Path(output), simulated_too=False, imported_too=False)
+    require_no_input(Path(output), (path for spec in files for path in spec.paths))
     _check_specs(files)
     about_skin = _described(files, about.skin)
     loaded: list[_Loaded] = []

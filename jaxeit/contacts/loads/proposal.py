@@ -194,10 +194,14 @@ class Proposal:
             )
 
     def save(self, path: str | Path) -> None:
-        """Write the proposal as a NumPy .npz, whole or not at all; equal proposals give equal bytes."""
+        """Write the proposal as a NumPy .npz, whole or not at all; equal proposals give equal bytes.
+
+        Raises:
+            InverseError: where ``path`` is a file of another kind, which would be lost.
+        """
         numbers = {name: getattr(self, name) for name in NUMBERS}
         about = {"format": FORMAT} | dict(self.about)
-        write_arrays(path, {"about": np.array(json.dumps(about, indent=1))} | numbers)
+        write_arrays(path, {"about": np.array(json.dumps(about, indent=1))} | numbers, InverseError)
 
 
 NUMBERS = tuple(each.name for each in fields(Proposal) if each.name != "about")

@@ -114,6 +114,20 @@ def test_a_sensor_that_bends_is_to_be_calibrated_again(made, tmp_path):
         assert "calibrate again" in assess_log(made[0], session).health
 
 
+@pytest.mark.parametrize("lost", ["noise", "columns exchanged"])
+def test_a_sensor_that_does_not_follow_the_force_is_refused_and_nothing_is_written(lost, made, tmp_path, capsys):
+    """A torn tube: its gain is none that could be taken off, so that no file holds it."""
+    force, values = log(6)
+    noise = 1000 + np.random.default_rng(6).normal(0, 5, (N, 1))
+    given = (force, noise) if lost == "noise" else (values[:, 0], force[:, None] + 500)
+    path, new = write_log(tmp_path / "torn.h5", *given), tmp_path / "new.h5"
+    assert main(["recalibrate", str(made[1]), str(path), "-o", str(new), "--force"]) == 2
+    assert "torn.h5: /streams/pressure: does not follow the force" in capsys.readouterr().err
+    assert not new.exists()
+    with open_session(path) as session:
+        assert "calibrate again" in assess_log(made[0], session, ignore_errors=True).health
+
+
 def test_a_short_log_is_refused(made, tmp_path):
     force, values = log(5)
     path = write_log(tmp_path / "short.h5", force[:4], values[:4])
