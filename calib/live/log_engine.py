@@ -10,6 +10,7 @@ from .engine import ReceivedFrame
 from .results import LogResult
 
 REST_CHANGE = 2.0  # standard errors, by which the force may change while the zero is measured
+TOGETHER = 1_000  # ns between readings that one read of the link brought, which have one time of arrival
 
 
 class LogEngine:
@@ -28,6 +29,7 @@ class LogEngine:
         self.restless = False
         self._warm_up()
         self._tracker = calibration.tracker()
+        self._time: int | None = None  # of the last reading, ns
 
     def _warm_up(self) -> None:
         """Compile the programs, with readings in the middle of the calibrated ranges."""
@@ -66,7 +68,8 @@ class LogEngine:
     def step(self, arrival: ReceivedFrame, dropped: int = 0) -> LogResult | None:
         """Process one reading; None while the zero is being measured."""
         place = arrival.beside[:2] if self._calibration.needs_place else None
-        found = self._tracker.step(float(arrival.host), arrival.values, place)
+        self._time = arrival.host if self._time is None else max(arrival.host, self._time + TOGETHER)
+        found = self._tracker.step(float(self._time), arrival.values, place)
         if self._resting is not None:
             self._measure_zero(arrival.host, found)
             return None

@@ -84,6 +84,13 @@ def test_a_zero_is_not_measured_while_the_force_changes(files):
     assert found[-1].force[0] == pytest.approx(0.0, abs=0.1)
 
 
+def test_readings_that_arrive_together_are_taken_one_after_the_other(files):
+    """One read of a link may bring several readings, which then have one time of arrival."""
+    engine = LogEngine(calib.load_calibration(files / "plain.h5"))
+    found = [engine.step(ReceivedFrame(np.array([5.0]), np.zeros(0), host)).force[0] for host in (S, S, S + 1, 2 * S)]
+    np.testing.assert_allclose(found, found[0])
+
+
 def test_a_missing_reading_has_no_force(files):
     engine = LogEngine(calib.load_calibration(files / "plain.h5"))
     found = engine.step(ReceivedFrame(np.array([np.nan]), np.zeros(0), 0))

@@ -1,17 +1,20 @@
 """The calibration of a sensor without EIT: channels over time to newtons, and its file."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 from ...fitting.curves import CURVES
 from ...fitting.logs import LogModel, LogPrediction, LogTracker, travel_of, unseen_direction
 from ...fitting.selection import Candidate
 from ...session import SessionError, read_archive, write_archive
 from .evaluation import LogEvaluation
+from .readings import reading, readings, require_later
 from .shift import LogShift
 from .storage import fields_of_log, location_name, log_archive
 
@@ -58,32 +61,32 @@ class LogCalibration:
 
     def predict(
         self,
-        time: np.ndarray,
-        values: Float[np.ndarray, "n columns"],
-        place: Float[np.ndarray, "n 2"] | None = None,
+        time: ArrayLike,
+        values: ArrayLike,
+        place: ArrayLike | None = None,
     ) -> LogPrediction:
         """Force, standard error, 90 % interval and validity at times (n,) ns, from all channels of the stream.
 
         Times must rise. A force is not valid where a channel or the place lies outside the range that was calibrated.
 
         Args:
-            place: of the contact, m, as the stage tells it; only for a calibration that `needs_place`.
+            values: (n, columns) in the sensor's unit, NaN where missing; of a sensor of one channel also (n,).
+            place: of the contact (n, 2) m, as the stage tells it; only for a calibration that `needs_place`.
 
         Raises:
-            SessionError: if the number of channels is not that of the calibrated sensor, or the place is needed and
-                not given.
+            SessionError: if the number of channels is not that of the calibrated sensor, times do not rise or are not
+                in ns, lengths differ, or the place is needed and not given.
         """
+        self._require_place(place)
+        times, table, where = readings(time, values, place, self.columns, self.stream)
+        return self._moved(self.model.predict(times, table[:, self.kept], where))
+
+    def _require_place(self, place: object) -> None:
         if self.needs_place and place is None:
             raise SessionError(
                 "the calibration depends on the place of contact, and none is given: record the stream stage, or "
                 "calibrate with --location none"
             )
-        if values.ndim != 2 or values.shape[1] != self.columns:
-            raise SessionError(
-                f"/streams/{self.stream}: {values.shape[-1]} channels, but the calibration is of {self.columns}; "
-                "give the calibration of this sensor"
-            )
-        return self._moved(self.model.predict(time, values[:, self.kept], place))
 
     def _moved(self, found: LogPrediction) -> LogPrediction:
         return found if self.shift is None else self.shift.applied(found, float(self.model.noise.multiple))
@@ -143,12 +146,20 @@ class CalibrationTracker:
 
     def __init__(self, calibration: LogCalibration):
         self._calibration, self._tracker = calibration, LogTracker(calibration.model)
+        self._last = -math.inf  # time of the last reading, ns
 
-    def step(
-        self, time: float, values: Float[np.ndarray, " columns"], place: Float[np.ndarray, " 2"] | None = None
-    ) -> LogPrediction:
-        """Force, standard error, interval and validity of one reading, at a time (ns) that rises."""
-        return self._calibration._moved(self._tracker.step(time, values[self._calibration.kept], place))
+    def step(self, time: float, values: ArrayLike, place: ArrayLike | None = None) -> LogPrediction:
+        """Force, standard error, interval and validity of one reading (columns,), at a time (ns) that rises.
+
+        Raises:
+            SessionError: as for `LogCalibration.predict`; the reading then leaves the tracker as it was.
+        """
+        known = self._calibration
+        known._require_place(place)
+        at, row, where = reading(time, values, place, known.columns, known.stream)
+        require_later(at, self._last)
+        self._last = at
+        return known._moved(self._tracker.step(at, row[known.kept], where))
 
 
 def load_log_calibration(path: str | Path) -> LogCalibration:

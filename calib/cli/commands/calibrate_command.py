@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...calibration import Recipe
-from ...calibration.recipe_text import NONE
+from ...calibration.recipe_text import NONE, SWITCHES
 from ...session import Session
 from ..arguments import count, prepare_results, require_matplotlib_for, skin_of
 from ..recipe_options import IMAGING, add_recipe_arguments, recipe_of
@@ -160,7 +160,7 @@ def _refuse_single(args: argparse.Namespace) -> None:
         raise ValueError(f"--report {args.report}: every session gets a page of its own; give --report without a name")
 
 
-_NEED_EIT = ("skin", "locator", "folds", "fidelity", "baseline", "low_pass", *IMAGING)
+_NEED_EIT = ("skin", "locator", "folds", "fidelity", "baseline", "low_pass", *SWITCHES, *IMAGING)
 
 
 def _calibrate_logs(args: argparse.Namespace, recipe: Recipe, sessions: Sequence[Session]) -> int:
@@ -169,7 +169,7 @@ def _calibrate_logs(args: argparse.Namespace, recipe: Recipe, sessions: Sequence
     from ...calibration.logs.procedure import calibrate_logs, evaluate_log, render_log
     from ...session import open_session
 
-    given = ["--" + name.replace("_", "-") for name in _NEED_EIT if getattr(args, name) not in (None, [], NONE)]
+    given = ["--" + name.replace("_", "-") for name in _NEED_EIT if getattr(args, name) not in (None, False, NONE)]
     if given:
         raise ValueError(f"{', '.join(given)}: for sessions with EIT, and these hold none; leave it out")
     calibration = calibrate_logs(sessions, recipe, ignore_errors=args.force)

@@ -183,6 +183,67 @@ def test_evaluate_and_apply_take_the_calibration_of_a_log(few, tmp_path, capsys)
     assert "--low-pass: for calibrations with EIT" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", ["--fit-electrodes", "--learn-layer", "--even-sheet", "--fidelity=draft"])
+def test_options_for_eit_are_refused_for_a_log(option, few, tmp_path, capsys):
+    assert main(["calibrate", few[0], "-o", str(tmp_path / "c.h5"), option]) == 2
+    assert f"{option.split('=')[0]}: for sessions with EIT" in capsys.readouterr().err
+    assert not (tmp_path / "c.h5").exists()
+
+
+MS = np.arange(3) * 1_000_000  # ns
+COLUMN = np.full((3, 1), 500.0)
+IMPOSSIBLE = [
+    # times, values, what is said
+    (MS, np.ones((3, 4)), r"pressure: 4 channels, but the calibration is of 1"),
+    (MS, np.ones((3, 1, 1)), r"values: of shape \(3, 1, 1\); give a row of 1 channels for each time"),
+    (MS[:2], COLUMN, r"time: of shape \(2,\) for 3 rows of values; give one time for each row"),
+    (MS * [1.0, np.nan, 1.0], COLUMN, r"time: holds values that are not finite; give nanoseconds"),
+    (MS[::-1], COLUMN, r"time: 1000000 in row 1 is not after 2000000; give nanoseconds that rise"),
+    (np.zeros(3), COLUMN, r"time: 0.0 in row 1 is not after 0.0; give nanoseconds that rise"),
+    (MS / 1e9, COLUMN, r"time: rises by 0.001 ns from row to row; are these seconds\? give nanoseconds"),
+    (["a", "b", "c"], COLUMN, r"time: holds <U1; give nanoseconds"),
+    (MS, [["a"], ["b"], ["c"]], r"values: no table of numbers; give floats"),
+]
+
+
+@pytest.fixture(scope="module")
+def sensor(tmp_path_factory):
+    """A calibration of one channel."""
+    force = 10 * (1 + np.sin(np.arange(600) / RATE))
+    values = 100 * force[:, None] + np.random.default_rng(0).normal(0, 5, (600, 1))
+    return calibrated(write_log(tmp_path_factory.mktemp("sensor") / "log.h5", force, values))
+
+
+@pytest.mark.parametrize(("time", "values", "said"), IMPOSSIBLE)
+def test_impossible_readings_are_refused(time, values, said, sensor):
+    with pytest.raises(SessionError, match=said):
+        sensor.predict(time, values)
+
+
+def test_lists_and_a_plain_row_of_one_channel_are_taken(sensor):
+    expected = sensor.predict(MS, COLUMN).force
+    np.testing.assert_array_equal(sensor.predict(MS.tolist(), COLUMN.tolist()).force, expected)
+    np.testing.assert_array_equal(sensor.predict(MS, COLUMN[:, 0]).force, expected)
+    with pytest.raises(SessionError, match=r"place: of shape \(2, 2\) for 3 rows of values; give x and y for each row"):
+        sensor.predict(MS, COLUMN, np.zeros((2, 2)))
+
+
+def test_a_tracker_refuses_impossible_readings_and_goes_on(sensor):
+    tracker = sensor.tracker()
+    first = tracker.step(0, [500.0])
+    for time, values, said in [
+        (MS[1], np.full(4, 500.0), "4 channels, but the calibration is of 1"),
+        (0.02, [500.0], "time: 0.02 after 0, both in ns, is not later by 1 ns or more"),
+        (-MS[1], [500.0], "is not later by 1 ns"),
+        (np.nan, [500.0], "time: holds values that are not finite"),
+        (MS[1], np.ones((1, 1)), r"values: of shape \(1, 1\); give the 1 channels of one reading"),
+    ]:
+        with pytest.raises(SessionError, match=said):
+            tracker.step(time, values)
+    second = tracker.step(MS[1], 500.0)  # one channel may come as a plain number
+    np.testing.assert_allclose(np.concatenate([first.force, second.force]), sensor.predict(MS[:2], COLUMN[:2]).force)
+
+
 def test_logs_of_one_sensor_are_pooled_and_others_refused(array, few, tmp_path):
     with open_session(few[0]) as one, open_session(few[1]) as two:
         both = calibrate_logs([one, two], LINEAR)
