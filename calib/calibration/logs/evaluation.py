@@ -1,6 +1,6 @@
 """Errors of a log's calibration over the samples of a recording: size, intervals, and samples outside its range."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,8 @@ from ...fitting.logs import LogPrediction
 
 # Share of the range of forces above which relative errors count; below it they say nothing.
 RELATIVE_FROM = 0.1
+# RMSE over the standard deviation of the force: from here on the mean force would be as good a guess as the sensor.
+USELESS = 0.9
 THIRDS = ("low", "middle", "high")
 
 
@@ -44,6 +46,17 @@ class LogEvaluation:
     def known(self) -> np.ndarray:
         """Flags (n,) of the samples with a recorded and a predicted force."""
         return np.asarray(np.isfinite(self.force) & np.isfinite(self.predicted))
+
+    @property
+    def missing(self) -> str:
+        """Why no error is known, in words; empty: some sample has both a recorded and a predicted force."""
+        if self.known.any():
+            return ""
+        if not np.isfinite(self.force).any():
+            return "no sample has a recorded force; record the load cell to the end"
+        if not np.isfinite(self.predicted).any():
+            return "no sample has all channels, which tell the force; record the sensor to the end"
+        return "no sample has both a recorded force and all channels; record both to the end"
 
     def summary(self) -> dict[str, float]:
         """Summary statistics by name; forces in N, shares from 0 to 1, NaN where no sample tells.
@@ -107,9 +120,21 @@ def log_evaluation(
 ) -> LogEvaluation:
     """The evaluation of predictions at times (n,) ns, for recorded forces (n,) N."""
     seconds = (np.asarray(time, float) - float(time[0])) / 1e9 if len(time) else np.empty(0)
+    notes = (*notes, *_uselessness(found.force, force))
     return LogEvaluation(
         title, seconds, force, found.force, found.standard_error, found.low, found.high, found.valid, notes
     )
+
+
+def _uselessness(predicted: np.ndarray, force: np.ndarray) -> Iterator[str]:
+    """A note where predicted forces are no better than the mean of the recorded ones."""
+    rows = np.isfinite(predicted) & np.isfinite(force)
+    error, varies = np.sqrt(_mean((predicted - force)[rows] ** 2)), float(np.std(force[rows])) if rows.any() else 0.0
+    if varies > 0 and error > USELESS * varies:
+        yield (
+            f"the errors are as large as the forces vary (RMSE {error:.3g} N, standard deviation of the force "
+            f"{varies:.3g} N): the sensor does not tell this force"
+        )
 
 
 def thirds(force: Float[np.ndarray, " n"]) -> np.ndarray:
@@ -126,15 +151,16 @@ def render_evaluation(evaluation: LogEvaluation, title: str = "") -> str:
     """The results as lines for a terminal."""
     s = evaluation.summary()
     each = ", ".join(f"{name} {_percent(s[f'coverage_{name}'])}" for name in THIRDS)
-    lines = [
-        f"{title or evaluation.title}: {s['samples']:.0f} samples",
-        f"  force RMSE {s['force_rmse']:.3f} N = {s['force_rmse_percent_full_scale']:.1f} % of the largest force, "
-        f"MAPE {s['force_mape']:.1f} % (forces above {RELATIVE_FROM:.0%} of the largest), "
+    errors = (
+        f"  force RMSE {s['force_rmse']:.3f} N = {_percent(s['force_rmse_percent_full_scale'] / 100)} of the largest "
+        f"force, MAPE {_percent(s['force_mape'] / 100)} (forces above {RELATIVE_FROM:.0%} of the largest), "
         f"bias {s['force_bias']:+.3f} N",
         f"  within the 90 % interval: {_percent(s['coverage'])} of samples; by third of force: {each}",
         f"  outside the calibrated range: {_percent(s['outside_share'])} of samples",
-    ]
-    return "\n".join(lines + [f"  note: {note}" for note in evaluation.notes])
+    )
+    lines = [f"  errors not known: {evaluation.missing}"] if evaluation.missing else errors
+    heading = f"{title or evaluation.title}: {s['samples']:.0f} samples"
+    return "\n".join([heading, *lines, *(f"  note: {note}" for note in evaluation.notes)])
 
 
 def _percent(share: float) -> str:

@@ -274,6 +274,41 @@ def test_errors_and_coverage_by_hand():
     assert np.isnan(s["coverage_middle"])
 
 
+def test_a_held_out_half_without_forces_is_named(tmp_path, capsys):
+    """The load cell was unplugged half way: no error is known, which is said instead of nan."""
+    force = 10 * (1 + np.sin(np.arange(600) / RATE * 3))
+    values = 100 * force[:, None] + np.random.default_rng(0).normal(0, 5, (600, 1))
+    force[300:] = np.nan
+    log = write_log(tmp_path / "log.h5", force, values)
+    assert main(["calibrate", str(log), "--curve", "linear", "-o", str(tmp_path / "c.h5")]) == 0
+    said = capsys.readouterr().out
+    assert "errors not known: no sample has a recorded force; record the load cell to the end" in said
+    assert "nan" not in said
+
+
+@pytest.mark.parametrize(
+    ("force", "predicted", "said"),
+    [
+        ([1.0, 2.0], [np.nan, np.nan], "no sample has all channels"),
+        ([1.0, np.nan], [np.nan, 2.0], "no sample has both"),
+        ([1.0, np.nan], [1.0, np.nan], ""),
+    ],
+)
+def test_what_is_missing_is_named(force, predicted, said):
+    found = LogPrediction(np.array(predicted), *np.ones((3, 2)), np.ones(2, bool))
+    missing = log_evaluation("by hand", np.arange(2.0), np.array(force), found).missing
+    assert missing.startswith(said)
+    assert bool(missing) == bool(said)
+
+
+@pytest.mark.parametrize(("error", "noted"), [(0.5, False), (3.0, True)])
+def test_errors_as_large_as_the_forces_are_noted(error, noted):
+    force = np.array([0.0, 4.0, 0.0, 4.0])
+    found = LogPrediction(force + error * np.array([1, 1, -1, -1]), *np.ones((3, 4)), np.ones(4, bool))
+    notes = log_evaluation("by hand", np.arange(4.0), force, found).notes
+    assert [("the errors are as large as the forces vary" in note) for note in notes] == [True] * noted
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_way")
 def test_a_log_that_only_loads_says_that_hysteresis_is_not_in_its_intervals(tmp_path, capsys):
