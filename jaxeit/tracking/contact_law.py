@@ -30,7 +30,7 @@ FEWEST, SURE = 5, 3.0
 # How far beyond the logs of force and width from which it was learned the law holds; its largest log factor; and the
 # least slope 1 + b, below which readings hardly tell a force.
 BEYOND, MOST, LEAST_SLOPE = 0.5, 3.0, 0.3
-USUAL = np.log([LoadSettings().force, LoadSettings().width])
+USUAL = np.log([LoadSettings.force, LoadSettings.width])
 
 
 class ContactLaw(NamedTuple):
