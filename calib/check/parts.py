@@ -8,6 +8,7 @@ from ..session.units import SECOND
 
 MIN_ROWS = 2  # presses in either part
 MAX_STRAY = 0.15  # of the presses, that may contradict a part
+CLEAREST_STEP = 1e9  # scatters: levels without any scatter, such as those of a dead channel, step no clearer
 
 
 class Part(NamedTuple):
@@ -61,4 +62,5 @@ def stepped_part(level: np.ndarray) -> tuple[int, float] | None:
     before, after = parts[best]
     scatter = float(np.median(np.abs(np.concatenate([before - np.median(before), after - np.median(after)]))))
     step = float(np.median(after) - np.median(before))
-    return splits[best], step / max(scatter, np.finfo(float).tiny)
+    clearness = step / scatter if scatter * CLEAREST_STEP > abs(step) else np.sign(step) * CLEAREST_STEP
+    return splits[best], float(clearness)

@@ -56,10 +56,13 @@ def crossing(time: np.ndarray, signal: np.ndarray, level: float) -> float:
 
 
 def _rise_times(stream: ReadableStream, windows: PressWindows, i: int) -> list[float]:
-    """Times (ns) of the rise through `RISE_FRACTIONS` of the way from rest to hold."""
+    """Times (ns) of the rise through `RISE_FRACTIONS` of the way from rest to hold; NaN without samples of both."""
     time, values = remove_baseline(stream, windows, i, TwoSided(), ())
     values = values[:, np.isfinite(values).all(axis=0)]
-    rests, holds = (values[slice(*index_ranges(time, getattr(windows, n)[i]))].mean(0) for n in ("rest_before", "hold"))
+    ends = [values[slice(*index_ranges(time, getattr(windows, name)[i]))] for name in ("rest_before", "hold")]
+    if not all(map(len, ends)):
+        return [float("nan")] * len(RISE_FRACTIONS)
+    rests, holds = (part.mean(0) for part in ends)
     # Along the change that the press makes: a norm would fold where a stream is early and its rest is none.
     signal = values @ (holds - rests)
     rest, hold = rests @ (holds - rests), holds @ (holds - rests)

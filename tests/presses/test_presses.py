@@ -232,6 +232,17 @@ def test_onset_delay_of_a_late_stream_is_found():
     assert onsets["eit"].shift == pytest.approx(0.030, abs=0.005)
 
 
+def test_a_stream_of_noise_has_no_delay_and_warns_of_nothing():
+    """Windows that follow noise come to where there is no sample."""
+    times = edges(3)
+    time, presses = clock(24.0), timeline(times)
+    force = ArrayStream("force", time, trapezoids(time, times, 5.0)[:, None])
+    few = ArrayStream("pressure", time[::1000], np.random.default_rng(0).normal(size=(5, 1)))
+    found = onset_delays(force, [few], presses, press_windows(presses))["pressure"]
+    assert found.presses == 0
+    assert np.isnan(found.delay)
+
+
 def test_a_curved_response_is_delayed_but_not_shifted():
     """What follows the square of the force rises late at its half, but begins and ends its rise with the force."""
     times = edges(6)
