@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, overload
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -149,12 +150,12 @@ def from_numbers(
         if ((array < 0) | (array >= count)).any():
             raise StorageError(f"{name}: must count the {count} {what} from 0")
     _require_possible({name: np.asarray(numbers[name]) for name in names})
-    predict = jnp.asarray(numbers["predict"])
+    predict = jax.device_put(numbers["predict"])
     whitening, picture = _whitening(numbers, sizes["k"], predict.dtype), _picture(numbers, shape, extent)
     about = Provenance(provenance or {})
     if iterative:
         return _iterative(numbers, imaging, predict, whitening, picture, about)
-    factor, variance = jnp.asarray(numbers["factor"]), jnp.asarray(numbers["variance"])
+    factor, variance = jax.device_put(numbers["factor"]), jax.device_put(numbers["variance"])
     return Reconstructor(
         factor=factor, variance=variance, predict=predict, whitening=whitening, picture=picture, provenance=about
     )
@@ -173,14 +174,14 @@ def _iterative(
             "the arrays are of an iterative method; give Imaging(method=..., prior=...) that they are for"
         )
     problem = Problem(
-        jacobian=jnp.asarray(numbers["jacobian"]),
-        readings=jnp.asarray(numbers["count"]),
-        hyperparameter=jnp.asarray(numbers["hyperparameter"]),
+        jacobian=jax.device_put(numbers["jacobian"]),
+        readings=jax.device_put(numbers["count"]),
+        hyperparameter=jax.device_put(numbers["hyperparameter"]),
         prior=imaging.prior,
         picture=picture,
     )
     return IterativeReconstructor(
-        compress=jnp.asarray(numbers["compress"]),
+        compress=jax.device_put(numbers["compress"]),
         problem=problem,
         method=imaging.method,
         predict=predict,
@@ -197,19 +198,19 @@ def _whitening(numbers: Mapping[str, np.ndarray], k: int, dtype: np.dtype) -> Wh
         pairs=jnp.asarray(numbers["pairs"], jnp.int32),
         lines=jnp.asarray(lines, jnp.int32),
         sign=jnp.asarray(sign, dtype),
-        current=jnp.asarray(numbers["current"]),
-        weight=jnp.asarray(numbers["weight"]),
+        current=jax.device_put(numbers["current"]),
+        weight=jax.device_put(numbers["weight"]),
         channels=jnp.asarray(numbers["channels"], bool),
-        shares=None if shares is None else jnp.asarray(shares),
+        shares=None if shares is None else jax.device_put(shares),
     )
 
 
 def _picture(numbers: Mapping[str, np.ndarray], shape: tuple[int, ...], extent: tuple[float, ...]) -> Picture:
     return Picture(
-        centres=jnp.asarray(numbers["centres"]),
-        areas=jnp.asarray(numbers["areas"]),
+        centres=jax.device_put(numbers["centres"]),
+        areas=jax.device_put(numbers["areas"]),
         edges=jnp.asarray(numbers["edges"], jnp.int32),
-        edge_length=jnp.asarray(numbers["edge_length"]),
+        edge_length=jax.device_put(numbers["edge_length"]),
         shape=tuple(shape),
         extent=(extent[0], extent[1], extent[2], extent[3]),
     )

@@ -233,7 +233,7 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
     skin = je.skin.parse_skin(str(attrs["skin_toml"]), "calibration: skin_toml")
     provenance = {k.removeprefix("provenance_"): str(v) for k, v in attrs.items() if k.startswith("provenance_")}
     recon, pads = _recon_from(archive, provenance), len(skin.pads)
-    masks = jnp.asarray(shaped(arrays, "image/masks", (pads, recon.areas.size), "f"))
+    masks = jax.device_put(shaped(arrays, "image/masks", (pads, recon.areas.size), "f"))
     of_pads = _pads_from(arrays, CURVES.find(provenance["curve"]), pads)
     _require_possible(arrays)
     parts = {
@@ -291,7 +291,7 @@ def _curves_from(arrays: Mapping[str, np.ndarray], kind: type[AbstractCurve], pa
     choices = {f.name: np.asarray((old or arrays)[f"pads/curve-{f.name}"]) for f in fields(kind)}
     for name, array in choices.items():
         shaped(choices, name, (pads, *array.shape[1:]), "f")
-    curve = kind(**{name: jnp.asarray(array) for name, array in choices.items()})
+    curve = kind(**{name: jax.device_put(array) for name, array in choices.items()})
     return FittedCurve(curve=curve, **_fitted(arrays, "pads/", pads, kind()))
 
 
@@ -303,10 +303,10 @@ def field_from(arrays: Mapping[str, np.ndarray], kind: type[AbstractField]) -> F
     missing = {f.name for f in fields(kind)} - choice.keys() - kind.early.keys()
     if missing:
         raise KeyError(f"location/choice-{min(missing)}")
-    geometry = {f.name: jnp.asarray(arrays[f"location/geometry-{f.name}"]) for f in fields(Geometry)}
+    geometry = {f.name: jax.device_put(arrays[f"location/geometry-{f.name}"]) for f in fields(Geometry)}
     # early versions did not store these
     given = {"location/effective": np.asarray(np.nan), "location/error_scale": np.ones(()), **arrays}
-    numbers = {name: jnp.asarray(given[f"location/{name}"]) for name in _FIELD_FIELDS}
+    numbers = {name: jax.device_put(given[f"location/{name}"]) for name in _FIELD_FIELDS}
     return FittedField(field=restored(kind, choice), geometry=Geometry(**geometry), **numbers)
 
 
@@ -359,7 +359,7 @@ def _fitted(arrays: Mapping[str, np.ndarray], where: str, pads: int, curve: Abst
     tails = {"parameters": (curve.size,), "covariance": (curve.size, curve.size), "pressure_range": (2,)}
     kinds = dict.fromkeys(("n", "n_missing", "n_groups", "rank", "result"), "iu")
     return {
-        name: jnp.asarray(shaped(arrays, where + name, (pads, *tails.get(name, ())), kinds.get(name, "f")))
+        name: jax.device_put(shaped(arrays, where + name, (pads, *tails.get(name, ())), kinds.get(name, "f")))
         for name in _CURVE_FIELDS
     }
 

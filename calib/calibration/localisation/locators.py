@@ -241,5 +241,5 @@ def _module(kind: type, numbers: dict[str, np.ndarray], at: str, dtype: Any) -> 
             parts[part.name] = int(numbers[at + part.name])
         else:
             array = numbers[at + part.name]
-            parts[part.name] = jnp.asarray(array, dtype if array.dtype.kind == "f" else None)
+            parts[part.name] = jax.device_put(array.astype(dtype) if array.dtype.kind == "f" else array)
     return kind(**parts)
