@@ -151,11 +151,11 @@ def test_programs_of_pages_that_go_on_from_a_calibration(calibrated, tmp_path, m
     with calib.open_session("other.h5") as session:
         moved = follow("a-week-later.md", {"calib": calib, "calibration": calibration, "session": session})["moved"]
     assert np.isfinite(moved.recalibration.log_gain).all()
-    with calib.open_session("log.h5") as log, calib.open_session("later.h5") as later:
-        fitted, signal = calib.calibration.calibrate_logs([log]), later.streams["pressure"]
-        time, values = signal.time, signal.read()
-    monkeypatch.chdir(tmp_path)
-    fitted.save("calibration.h5")
+    for name in ("log.h5", "later.h5"):
+        shutil.copy(name, tmp_path)
+    monkeypatch.chdir(tmp_path)  # where the page writes another calibration.h5
+    with calib.open_session("later.h5") as later:
+        time, values = later.stream("pressure").time, later.stream("pressure").read()
     found = follow("logs.md", {"calib": calib, "time": time, "values": values})["found"]
     assert found.force.shape == found.valid.shape == time.shape
     assert 9 < np.nanmax(found.force) < 12

@@ -17,6 +17,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxeit.kinds import require_kind
+
 from ..bench import BenchError, FrameSet
 from ..bench.frame_shards import EXTRA, SHARDS, Shard
 from ..bench.scene_frames import SceneFrames
@@ -101,6 +103,8 @@ def write_training_frames(
         ):
             pass  # a step of the training
     """
+    give = "calib.bench.FrameSet(calib.load_bench(path), frames)"
+    require_kind(frame_set, FrameSet, BenchError, "a FrameSet", give, "write_training_frames")
     if jobs < 1:
         raise BenchError(f"{jobs} jobs; give one or more")
     folder, versions = Path(folder), _versions(frame_set.file_format)

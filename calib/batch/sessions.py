@@ -11,7 +11,7 @@ import os
 import pickle
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, as_completed
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,6 +29,7 @@ from ..report.figures.parts import require_matplotlib
 from ..report.log_document import write_log_report
 from ..runtime import settings, take_over
 from ..session import Session, SessionError, open_session
+from ..session.given import paths_of
 from .digests import describe, digest
 from .logs import ensure_log_calibration
 from .workers import ONE_AT_A_TIME, spawned_pool
@@ -82,7 +83,7 @@ class _Task:
 
 
 def calibrate_many(
-    paths: Sequence[str | os.PathLike[str]],
+    paths: Iterable[str | os.PathLike[str]],
     out: str | os.PathLike[str],
     *,
     recipe: Recipe | None = None,
@@ -111,7 +112,8 @@ def calibrate_many(
     processes import the main module.
 
     Raises:
-        SessionError: two sessions would have one result, or the folder cannot be made.
+        SessionError: a path stands in the place of the list, two sessions would have one result, or the folder cannot
+            be made.
         ReportError: a report is wanted and matplotlib is not installed.
 
     Example:
@@ -123,7 +125,7 @@ def calibrate_many(
     """
     if report:
         require_matplotlib()
-    tasks = _tasks(paths, Path(out), report, skin, recipe or Recipe(), ignore_errors)
+    tasks = _tasks(paths_of(paths, "calibrate_many"), Path(out), report, skin, recipe or Recipe(), ignore_errors)
     outcomes: dict[str, Outcome] = {}
 
     def note(outcome: Outcome) -> None:

@@ -13,8 +13,10 @@ import jax
 import numpy as np
 
 import jaxeit as je
+from jaxeit.kinds import require_kind
 
 from ..session import PressTable, SessionFacts, SessionWriter, Status, StreamFacts
+from ..session.given import call_on
 from .bench import Bench, BenchError
 from .motion import Motion
 from .streams import AbstractSimulatedStream, SampleBlock, SimulatedStreams, simulated_streams
@@ -45,6 +47,7 @@ def simulate(
     Raises:
         ValueError: if the skin has no pads, the scene cannot be discretised or the file not written.
     """
+    require_kind(bench, Bench, BenchError, "a Bench", call_on("calib.load_bench", bench), "simulate")
     if not bench.scene.skin.pads:
         other = "je.forward, and frames of --random-scenes, need none"
         raise BenchError(f"the skin {bench.scene.skin.name!r} has no pads for a session to hold; add [[pads]]; {other}")

@@ -13,12 +13,16 @@ from ..check.placement import placement_note
 from ..presses.streams import finite_mean
 from ..presses.table import Level, Processing, resting_levels
 from ..session import ArchiveWriter, Session
+from ..session.given import require_session
 from .calibration import Calibration
 from .force_maps import USED, ForceEstimate
 from .frame_blocks import FrameBlock, FrameBlocks, Progress, estimated
+from .given import require_calibration, require_no_eit_choices
 from .localisation.contact_tracks import ABOUT, ContactTracks, NotFollowed, quiet_tracker
 from .localisation.load_windows import SeenLoads, WindowedFrames, fit_windows
 from .localisation.proposals import ProposalChoice, chosen_proposal
+from .logs.calibration import LogCalibration
+from .logs.procedure import apply_log
 from .places_in_space import normals_in_space, pad_centres, points_in_space
 from .recalibration.agreement import agreement_of_use
 
@@ -29,7 +33,7 @@ LEVELS = 64  # times at which the level without contact is averaged
 
 
 def apply(
-    calibration: Calibration,
+    calibration: Calibration | LogCalibration,
     session: Session,
     path: str | Path,
     *,
@@ -43,6 +47,8 @@ def apply(
     tell: Callable[[str], object] = lambda line: None,
 ) -> Path:
     """Write the force map of every EIT frame of a session; memory does not grow with its length.
+
+    By the calibration of a log, write its forces over time, as `calib.calibration.apply_log` does, which returns them.
 
     The file, format skin-forcemap, appears only when complete. Where the pads disagree with the image, intervals are
     wider by as much. What lies outside of what was calibrated is told, and stands in the file's attribute "outside".
@@ -64,6 +70,12 @@ def apply(
         InverseError: if the proposal was trained for another skin.
         RecordingError: if `check_session` finds an error in its skin, frames or pressures.
     """
+    require_session(session, "apply")
+    if isinstance(calibration, LogCalibration):
+        choices = {"processing": processing, "loads": loads, "load_settings": load_settings, "track": track}
+        require_no_eit_choices("apply", **choices)
+        return _write_log_forces(calibration, session, path, ignore_errors, tell)
+    require_calibration(calibration, "apply")
     processing = processing or calibration.processing
     proposed = None if loads is None else chosen_proposal(proposal, calibration.skin, tell, load_settings)
     levels = resting_levels(session, calibration.skin, processing)
@@ -88,6 +100,20 @@ def apply(
                 one.add(block, found)
         for one in also:
             tell(one.end())
+    return Path(path)
+
+
+def _write_log_forces(
+    calibration: LogCalibration,
+    session: Session,
+    path: str | Path,
+    ignore_errors: bool,
+    tell: Callable[[str], object],
+) -> Path:
+    """`apply` for the calibration of a log."""
+    found = apply_log(calibration, session, path, ignore_errors=ignore_errors)
+    if unseen := calibration.unseen(found.force):
+        tell(f"note: {unseen}")
     return Path(path)
 
 

@@ -17,6 +17,7 @@ from ..fitting.fields.places import nowhere
 from ..fitting.pad_gains import PadGains
 from ..fitting.pads import PadModel
 from .calibration import Calibration
+from .given import require_calibration
 from .localisation.locators import AbstractLocator, locate
 
 USED = ("/device", "/streams/eit", "/streams/pressure")  # parts of a session from which forces are computed
@@ -95,6 +96,7 @@ def force_map(
     Raises:
         ValueError: if the shapes do not fit the calibration.
     """
+    require_calibration(calibration, "force_map", "give calibration.predict(time, values)")
     frames, pressures = np.atleast_2d(frames), np.atleast_2d(pressures)
     readings, pads = calibration.recon.readings, len(calibration.skin.pads)
     if frames.shape[1] != readings or pressures.shape != (len(frames), pads):

@@ -1,9 +1,9 @@
 """The calibration procedure: from sessions to a calibration, and its evaluation on another session."""
 
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import jax
 import numpy as np
@@ -27,14 +27,19 @@ from ..presses.pooled import PooledPresses, pool_presses
 from ..presses.skins import differing_parts
 from ..presses.table import PressMeasurements, Processing, measure
 from ..session import Session, SessionError
+from ..session.given import require_session, sessions_of
 from .archives.storage import describe
 from .calibration import Calibration
 from .evaluation import Evaluation, centre_of
 from .fitted_sessions import FITTED, is_fitted, require_each_once
+from .given import require_calibration, require_no_eit_choices
 from .hysteresis_loops import typical_loops
 from .layer import learn_layer
 from .localisation.electrode_places import PlacedElectrodes, place_electrodes
 from .localisation.press_images import Imager, PressImages, prepare_imager
+from .logs.calibration import LogCalibration
+from .logs.evaluation import LogEvaluation
+from .logs.procedure import evaluate_log
 from .press_examples import press_examples, press_probes
 from .recalibration.agreement import agreement_of_presses
 from .recipe import Recipe
@@ -45,7 +50,7 @@ PLACING, LEARNING = "placing the electrodes", "learning the contact layer"
 
 
 def calibrate(
-    sessions: Sequence[Session],
+    sessions: Session | Iterable[Session],
     skin: je.Skin | None = None,
     *,
     recipe: Recipe | None = None,
@@ -55,7 +60,8 @@ def calibrate(
     """Fit one pressure-force curve per pad, and a correction by location, and prepare the image reconstruction.
 
     Args:
-        sessions: recorded on one skin, from `open_session`.
+        sessions: recorded on one skin, from `open_session`; one, or several. For sessions without EIT see
+            `calib.calibration.calibrate_logs`.
         skin: default: the one described in the first session.
         recipe: all choices of the procedure; default: those of the paper.
         ignore_errors: calibrate also from sessions in which `check_session` finds an error; the errors are then kept in
@@ -68,8 +74,8 @@ def calibrate(
         FitError: a pad was not pressed enough to fit its curve, or there are too few presses for a field.
         InverseError, HyperparameterError: no image can be made as the recipe asks.
     """
-    if not sessions:
-        raise SessionError("calibrate: no session given; give one or more session files")
+    sessions = sessions_of(sessions, "calibrate")
+    _require_eit(sessions)
     require_each_once(sessions)
     recipe = recipe or Recipe()
     skin = skin or _one_skin(sessions)
@@ -83,6 +89,17 @@ def calibrate(
         for session in sessions:
             calibration = learn_layer(calibration, session, ignore_errors=ignore_errors)
     return calibration
+
+
+def _require_eit(sessions: Sequence[Session]) -> None:
+    """Refuse no session at all, and sessions all of which are logs."""
+    if not sessions:
+        raise SessionError("calibrate: no session given; give one or more session files")
+    if all("eit" not in session.streams for session in sessions):
+        raise SessionError(
+            f"{sessions[0].name}: /streams/eit: missing, as in a log; calibrate logs by "
+            "calib.calibration.calibrate_logs(sessions)"
+        )
 
 
 def _one_skin(sessions: Sequence[Session]) -> je.Skin:
@@ -221,14 +238,26 @@ def _provenance(
     }
 
 
+@overload
 def evaluate(
-    calibration: Calibration,
+    calibration: Calibration, session: Session, processing: Processing | None = None, *, ignore_errors: bool = False
+) -> Evaluation: ...
+
+
+@overload
+def evaluate(
+    calibration: LogCalibration, session: Session, processing: None = None, *, ignore_errors: bool = False
+) -> LogEvaluation: ...
+
+
+def evaluate(
+    calibration: Calibration | LogCalibration,
     session: Session,
     processing: Processing | None = None,
     *,
     ignore_errors: bool = False,
-) -> Evaluation:
-    """Evaluate a calibration on the presses of another session.
+) -> Evaluation | LogEvaluation:
+    """Evaluate a calibration on the presses of another session, or that of a log on another log.
 
     The notes tell what lies outside of what was calibrated. Where the pads disagree with the image, intervals are wider
     by as much.
@@ -241,8 +270,18 @@ def evaluate(
         SessionError: if the session was recorded on another skin or cannot be used.
         RecordingError: if `check_session` finds an error in the session.
     """
+    require_session(session, "evaluate")
+    if isinstance(calibration, LogCalibration):
+        require_no_eit_choices("evaluate", processing=processing)
+        return evaluate_log(calibration, session, ignore_errors=ignore_errors)
+    require_calibration(calibration, "evaluate")
+    return _evaluation(calibration, session, processing or calibration.processing, ignore_errors)
+
+
+def _evaluation(calibration: Calibration, session: Session, processing: Processing, ignore_errors: bool) -> Evaluation:
+    """`evaluate` for the calibration of a skin."""
     fitted = is_fitted(calibration.provenance, session)
-    found = measure(session, calibration.skin, processing or calibration.processing)
+    found = measure(session, calibration.skin, processing)
     ignored = accept([session], calibration.skin, ignore_errors=ignore_errors)
     _require_channels(calibration, found)
     images = Imager(calibration.recon, calibration.masks, calibration.locator).presses(found.dv)

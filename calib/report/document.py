@@ -11,6 +11,7 @@ import jaxeit as je
 
 from ..calibration.calibration import Calibration
 from ..calibration.evaluation import METHODS, THIRDS, Evaluation, localisation_errors
+from ..calibration.given import require_calibration
 from ..fitting.selection import Candidate
 from ..session import replacing
 from .figures.parts import require_matplotlib
@@ -41,12 +42,15 @@ def write_report(
 
     Raises:
         ReportError: matplotlib is not installed.
+        SessionError: for a path or the calibration of a log in the place of the calibration.
         SessionError, OSError: a file cannot be written.
 
     Example:
         for path in calib.write_report(calibration, "report.html"):
             print(path)  # the page, and its figures as PNG
     """
+    for_logs = "write its page by calib.report.log_document.write_log_report"
+    require_calibration(calibration, "write_report", for_logs)
     require_matplotlib()
     page = Path(path)
     pictures = calibration_pictures(calibration, evaluations)

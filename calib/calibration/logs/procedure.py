@@ -5,7 +5,7 @@ influence on the choice. The calibration that is kept is the chosen kind of mode
 """
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,6 +15,7 @@ import numpy as np
 
 import jaxeit as je
 from jaxeit.budget import current_budget
+from jaxeit.kinds import require_kind
 
 from ...check.acceptance import accept
 from ...fitting.curves import CURVES, AbstractCurve
@@ -35,6 +36,7 @@ from ...fitting.results import FitError
 from ...presses.channel_faults import MIN_ARRAY_CHANNELS, faults
 from ...presses.streams import resample
 from ...session import Session, SessionError, Stream, write_archive
+from ...session.given import call_on, require_session, sessions_of
 from ..fitted_sessions import FITTED, is_fitted, require_each_once
 from ..recipe import Recipe
 from ..recipe_text import AUTO_CURVES
@@ -48,7 +50,7 @@ Log = tuple[np.ndarray, np.ndarray, np.ndarray]  # times (n,) ns, values (n, cha
 
 
 def calibrate_logs(
-    sessions: Sequence[Session], recipe: Recipe | None = None, *, ignore_errors: bool = False
+    sessions: Session | Iterable[Session], recipe: Recipe | None = None, *, ignore_errors: bool = False
 ) -> LogCalibration:
     """Fit one model to the logs of one sensor.
 
@@ -75,6 +77,9 @@ def calibrate_logs(
             forces = calibration.apply_log(sensor, log, "forces.h5")
             print(forces.force[-1], forces.low[-1], forces.high[-1])  # N
     """
+    sessions = sessions_of(sessions, "calibrate_logs")
+    if not sessions:
+        raise SessionError("calibrate_logs: no session given; give one or more logs")
     require_each_once(sessions)
     recipe = recipe or Recipe()
     ignored = accept(sessions, None, ignore_errors=ignore_errors)
@@ -260,7 +265,15 @@ def _provenance(
     }
 
 
-def stream_of(calibration: LogCalibration, session: Session) -> Stream:
+def stream_of(calibration: LogCalibration, session: Session, call: str) -> Stream:
+    """The stream of a session that a calibration takes, in a ``call``.
+
+    Raises:
+        SessionError: for what is no calibration of a log or no session, and for another sensor.
+    """
+    require_session(session, call)
+    give = f"{call_on('calib.load_calibration', calibration)} of a log"
+    require_kind(calibration, LogCalibration, SessionError, "the calibration of a log", give, call)
     signal = session.stream(calibration.stream)
     if signal.channels != calibration.columns or _unit(signal) != calibration.unit:
         raise SessionError(
@@ -277,7 +290,7 @@ def evaluate_log(calibration: LogCalibration, session: Session, *, ignore_errors
         SessionError: if a stream is missing, or the sensor is another.
         RecordingError: if `check_session` finds an error in the session, unless errors are ignored.
     """
-    signal = stream_of(calibration, session)
+    signal = stream_of(calibration, session, "evaluate_log")
     ignored = accept([session], None, ignore_errors=ignore_errors)
     found = _predicted(calibration, session, signal)
     force = session.stream("force")
@@ -305,7 +318,7 @@ def apply_log(
         SessionError: if the stream of the signal is missing, or the sensor is another.
         RecordingError: if `check_session` finds an error in that stream, unless errors are ignored.
     """
-    signal = stream_of(calibration, session)
+    signal = stream_of(calibration, session, "apply_log")
     ignored = accept([session], None, ignore_errors=ignore_errors, where=(f"/streams/{signal.name}",))
     found = _predicted(calibration, session, signal)
     attrs: dict[str, str | int] = {

@@ -19,7 +19,7 @@ def assess_log(
     calibration: LogCalibration, session: Session, drift: GainDrift | None = None, *, ignore_errors: bool = False
 ) -> LogShift:
     """How far a log with known force is off a calibration; arguments and errors as for `recalibrate_log`."""
-    signal = stream_of(calibration, session)
+    signal = stream_of(calibration, session, "assess_log")
     ignored = accept([session], None, ignore_errors=ignore_errors)
     places = [place_of(session, session.stream("force").time)] if calibration.needs_place else None
     series = series_of([log_of(session)], places=places)

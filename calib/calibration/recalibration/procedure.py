@@ -9,13 +9,14 @@ as it is, and its uncertainty grows by what may have drifted.
 import abc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 import jaxeit as je
+from jaxeit.kinds import require_kind
 
 from ...check.acceptance import accept
 from ...fitting.curves.fitted import predict_pads
@@ -25,10 +26,14 @@ from ...fitting.gain_update import GainDrift, GainPrior, GainUpdate, update_gain
 from ...fitting.pad_gains import gain_slopes
 from ...presses.table import measure, require_skin
 from ...session import Session, SessionError
+from ...session.given import require_session
 from ..calibration import Calibration
 from ..fitted_sessions import require_not_moved_by
 from ..force_maps import USED, ForceLaw, law_of, unmoved_forces
+from ..given import require_calibration
 from ..localisation.press_images import Imager
+from ..logs.calibration import LogCalibration
+from ..logs.recalibration import recalibrate_log
 from .changes import Evidence, Recalibration
 from .image_reference import ImageReference, fit_reference
 from .ordinary_use import distinct, use_contacts
@@ -238,14 +243,36 @@ def update_from_use(prior: GainPrior, reference: ImageReference, noise: PressNoi
     return update_gains(prior, residuals, covariance, nuisance)
 
 
+@overload
 def recalibrate(
     calibration: Calibration,
     session: Session,
     evidence: AbstractEvidence | None = None,
     *,
     ignore_errors: bool = False,
-) -> Calibration:
+) -> Calibration: ...
+
+
+@overload
+def recalibrate(
+    calibration: LogCalibration,
+    session: Session,
+    evidence: AbstractEvidence | None = None,
+    *,
+    ignore_errors: bool = False,
+) -> LogCalibration: ...
+
+
+def recalibrate(
+    calibration: Calibration | LogCalibration,
+    session: Session,
+    evidence: AbstractEvidence | None = None,
+    *,
+    ignore_errors: bool = False,
+) -> Calibration | LogCalibration:
     """The same calibration, moved to what the pads read in a session. `Calibration.recalibration` says by how much.
+
+    The calibration of a log is moved by a log of known force, as `calib.calibration.recalibrate_log` does.
 
     Args:
         evidence: default: `KnownForces` for a session with a force stream, otherwise `OrdinaryUse`.
@@ -256,7 +283,10 @@ def recalibrate(
             gain of no pad, or has moved the calibration before.
         RecordingError: if `check_session` finds an error in what is used of the session.
     """
-    require_not_moved_by(calibration.provenance, session)
+    require_session(session, "recalibrate")
+    if isinstance(calibration, LogCalibration):
+        return recalibrate_log(calibration, session, _drift_of_log(evidence), ignore_errors=ignore_errors)
+    require_calibration(calibration, "recalibrate")
     require_not_moved_by(calibration.provenance, session)
     found = assess(calibration, session, evidence, ignore_errors=ignore_errors)
     if not found.determined.any() and not ignore_errors:
@@ -271,6 +301,13 @@ def recalibrate(
         simulated=calibration.simulated or session.simulated,
         notes=(*calibration.notes, found.health, *found.notes),
     )
+
+
+def _drift_of_log(evidence: AbstractEvidence | None) -> GainDrift | None:
+    """How far a log may have moved, of the evidence for it; SessionError for other evidence than known forces."""
+    give = "calib.calibration.KnownForces(), as the calibration is of a log, which only known force can move"
+    require_kind(evidence or KnownForces(), KnownForces, SessionError, "evidence for a log", give, "recalibrate")
+    return evidence.drift if isinstance(evidence, KnownForces) else None
 
 
 def assess(
@@ -289,6 +326,8 @@ def assess(
             unloaded = calibration.assess(mine, session, calibration.OrdinaryUse())
         print(change.health, change.log_gain, unloaded.advice)
     """
+    require_session(session, "assess")
+    require_calibration(calibration, "assess", "assess it by calib.calibration.assess_log")
     if session.skin_name and session.skin_name != calibration.skin.name:
         raise SessionError(
             f"{session.name}: recorded on the skin {session.skin_name!r}, but the calibration is of "

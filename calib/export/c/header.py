@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from ...calibration import Calibration, LogCalibration
+from ...calibration.given import require_calibration
 from ...session import replacing
 from ..errors import ExportError
 from .fields import LocationInC
@@ -89,10 +90,12 @@ def export_c(
 
     Raises:
         ExportError: if a part of the calibration cannot be exported; the message says which and what to do.
+        SessionError: for a path or another object in the place of the calibration.
         OSError: if the file cannot be written.
     """
     if isinstance(calibration, LogCalibration):
         raise ExportError("a log has no EIT and therefore no image; export the calibration of a skin")
+    require_calibration(calibration, "export_c")
     _require_choices(prefix, without_location, place)
     chosen = calibration if place is None else with_image_places(calibration, place)
     numbers = numbers_of(chosen, without_location=without_location)

@@ -1,7 +1,7 @@
 """Force maps as a LeRobot dataset: each force map is an episode, at a constant rate."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +14,7 @@ from ...calibration.application import FORMAT
 from ...calibration.frame_blocks import Progress
 from ...session import ArchiveReader, open_archive
 from ...session.errors import problem
+from ...session.given import paths_of
 from ...session.hdf5.storage import folder_beside
 from ..errors import ExportError
 from .files import DEFAULT_FEATURES, FrameFiles, info_of, write_metadata
@@ -52,7 +53,7 @@ class DatasetSummary:
 
 
 def export_lerobot(
-    sources: Sequence[str | os.PathLike[str]],
+    sources: Iterable[str | os.PathLike[str]],
     output: str | os.PathLike[str],
     *,
     task: str = "touch the skin",
@@ -77,16 +78,16 @@ def export_lerobot(
         ExportError: if the force maps are of different skins, an option is out of range, or the output exists.
         ImportError: without the library `pyarrow`, of the extra ``tables``.
     """
-    output = Path(output)
-    _require(sources, output, fps, full_scale)
-    skins = _skins_of([*map(Path, sources)])
+    output, paths = Path(output), paths_of(sources, "export_lerobot", ExportError)
+    _require(paths, output, fps, full_scale)
+    skins = _skins_of(paths)
     fps = fps or max(1, round(min(skin.rate for skin in skins)))
     full_scale = full_scale or rounded_up(max(skin.largest for skin in skins))
     with folder_beside(output) as temporary:
         folder = temporary / output.name
         folder.mkdir()
         features = features_of(skins[0].rows, skins[0].columns, list(skins[0].pads), full_scale)
-        episodes, stats = _write_frames([*map(Path, sources)], folder, features, fps, full_scale, task, progress)
+        episodes, stats = _write_frames(paths, folder, features, fps, full_scale, task, progress)
         frames = sum(row["length"] for row in episodes)
         info = info_of(features, fps, len(episodes), frames, ROBOT)
         write_metadata(folder, info, flat(stats), episodes, task)

@@ -2,6 +2,7 @@
 
 import csv
 import itertools
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from pathlib import Path
 from jaxeit.spelling import did_you_mean
 
 from ..errors import SessionError, printable, problem
+from ..given import paths_of
 from ..units import KNOWN_UNITS, UNITS
 from .limits import MAX_COLUMNS
 
@@ -42,20 +44,24 @@ class FileSpec:
     | gap             | pause before each following file; None: all files are of one clock          | s    |
     """
 
-    path: Path
+    path: str | os.PathLike[str]
     time: str
     time_unit: str
     streams: tuple[StreamSpec, ...]
     missing: tuple[float, ...] = ()
-    following: tuple[Path, ...] = ()
+    following: Sequence[str | os.PathLike[str]] = ()
     rate_hz: float | None = None
     start: float = 0.0
     gap: float | None = None
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "path", Path(self.path))
+        object.__setattr__(self, "following", tuple(paths_of(self.following, "FileSpec: following")))
+
     @property
     def paths(self) -> tuple[Path, ...]:
         """All files, in order."""
-        return (self.path, *self.following)
+        return tuple(map(Path, (self.path, *self.following)))
 
 
 def parse_time(text: str) -> tuple[str, str]:

@@ -1,0 +1,36 @@
+"""What a function is given in the place of the calibration of a skin, refused with the call to make."""
+
+from typing import Any
+
+from jaxeit.kinds import require_kind
+
+from ..session import SessionError
+from ..session.given import call_on
+from .calibration import Calibration
+from .logs.calibration import LogCalibration
+
+
+def require_calibration(calibration: Any, call: str, for_logs: str = "give that of a skin") -> None:
+    """Refuse what is no calibration of a skin, such as a path, in a ``call``.
+
+    Args:
+        for_logs: what to do with the calibration of a log, which functions that take one have handled before.
+
+    Raises:
+        SessionError: naming the call, and what to give.
+    """
+    if isinstance(calibration, LogCalibration):
+        raise SessionError(f"{call}: the calibration is of a log, which has no EIT; {for_logs}")
+    give = call_on("calib.load_calibration", calibration)
+    require_kind(calibration, Calibration, SessionError, "a Calibration", give, call)
+
+
+def require_no_eit_choices(call: str, **choices: object) -> None:
+    """Refuse choices about EIT for the calibration of a log.
+
+    Raises:
+        SessionError: naming the call and the first choice that is neither None nor False.
+    """
+    for name, value in choices.items():
+        if value is not None and value is not False:
+            raise SessionError(f"{call}: {name} is about EIT, and the calibration is of a log; leave out {name}")

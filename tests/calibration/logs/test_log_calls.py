@@ -1,0 +1,57 @@
+"""The functions of `calib` that take any calibration, given that of a log, as the command line is."""
+
+import numpy as np
+import pytest
+
+import calib
+from calib import calibration as room
+from calib.calibration.logs.procedure import FORCE_FORMAT
+from calib.session import SessionError, open_session, read_archive
+
+from .test_logs import AFFINE, write_log
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """A log of a sensor of one channel, open, and its calibration."""
+    phase = np.arange(1500) / 50
+    force = 10 * (1 + np.sin(2 * phase)) * (1 + 0.3 * np.sin(phase / 7))
+    noise = np.random.default_rng(0).normal(0, 5, (1500, 1))
+    path = write_log(tmp_path_factory.mktemp("log") / "log.h5", force, 100 * force[:, None] + noise)
+    with open_session(path) as session:
+        yield session, room.calibrate_logs(session, AFFINE)
+
+
+def test_the_calibration_of_a_log_is_evaluated_applied_and_moved_as_that_of_a_skin(log, tmp_path):
+    session, sensor = log
+    assert calib.evaluate(sensor, session).summary() == room.evaluate_log(sensor, session).summary()
+    told = []
+    written = read_archive(calib.apply(sensor, session, tmp_path / "forces.h5", tell=told.append), FORCE_FORMAT)
+    np.testing.assert_array_equal(written.arrays["force"], room.apply_log(sensor, session, tmp_path / "again.h5").force)
+    moved = calib.recalibrate(sensor, session, room.KnownForces())
+    assert moved.shift.gain == room.recalibrate_log(sensor, session).shift.gain
+
+
+def test_what_a_log_has_not_is_named_with_what_to_do(log, tmp_path):
+    session, sensor = log
+    refused = [
+        (lambda: calib.calibrate(session), r"log.h5: /streams/eit: missing, as in a log; .*calibrate_logs\(sessions\)"),
+        (lambda: calib.force_map(sensor, [1.0], [1.0]), r"force_map: the calibration is of a log.*calibration.predict"),
+        (lambda: room.assess(sensor, session), "assess: the calibration is of a log.*assess_log"),
+        (lambda: calib.recalibrate(sensor, session, room.OrdinaryUse()), "OrdinaryUse is not evidence for a log"),
+        (
+            lambda: calib.write_report(sensor, tmp_path / "r.html"),
+            "write_report: the calibration is of a log.*_log_rep",
+        ),
+        (lambda: calib.apply(sensor, session, tmp_path / "f.h5", track=True), "apply: track is about EIT.*leave out"),
+        (lambda: calib.apply(sensor, session, tmp_path / "f.h5", loads=1.0), "apply: loads is about EIT"),
+        (lambda: calib.evaluate(sensor, session, calib.presses.Processing()), "evaluate: processing is about EIT"),
+        (
+            lambda: room.evaluate_log("cal.h5", session),
+            r"evaluate_log: 'cal.h5' is not the calibration of a log; give c",
+        ),
+        (lambda: room.calibrate_logs([]), "calibrate_logs: no session given"),
+    ]
+    for call, said in refused:
+        with pytest.raises(SessionError, match=said):
+            call()
