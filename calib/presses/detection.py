@@ -162,7 +162,7 @@ def find_presses(
     if len(back):
         raise PressError(f"time does not increase at sample {back[0]}: sort the samples and drop equal times.")
     if np.isfinite(force).sum() < MIN_SAMPLES:
-        raise PressError("fewer than ten finite force samples: record a longer force stream.")
+        raise PressError(f"{np.isfinite(force).sum()} finite force samples; presses are found in {MIN_SAMPLES} or more")
     signal, noise, rate = _condition(time, force, limits)
     high = _default_threshold(signal, noise) if threshold is None else threshold
     runs = _hysteresis(signal, high / 2, high)

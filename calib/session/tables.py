@@ -119,6 +119,11 @@ class PressTable:
             if bad.any():
                 row = int(np.argmax(bad))
                 raise SessionError(f"presses: {name} of row {row} is not finite; correct that row")
+        bad = self.tip_diameter < 0
+        if bad.any():
+            row = int(np.argmax(bad))
+            found = self.tip_diameter[row]
+            raise SessionError(f"presses: tip_diameter of row {row} is {found:g} m; give 0, not known, or more")
         times = np.stack([self.t_press, self.t_hold0, self.t_hold1, self.t_release])
         bad = (np.diff(times, axis=0) < 0).any(axis=0)
         if bad.any():

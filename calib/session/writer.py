@@ -203,9 +203,8 @@ class SessionWriter(FileWriter):
     def _check_units(self, where: str, variable: str, units: str) -> None:
         expected = VARIABLE_UNIT.get(variable, units)
         if units not in UNITS or UNITS[units].si != units or units != expected:
-            what = f"{variable} in {units!r} is not SI"
-            todo = f"convert it to {UNITS[units].si if units in UNITS else expected} before writing"
-            raise self._problem(where, what, todo)
+            wanted = VARIABLE_UNIT.get(variable) or (UNITS[units].si if units in UNITS else "an SI unit")
+            raise self._problem(where, f"{variable} is given in {units!r}", f"convert it to {wanted} before writing")
 
     def _packing(self, where: str, dtype: np.dtype, facts: StreamFacts) -> tuple[float, float]:
         units, scale, offset = facts.units, facts.scale_factor, facts.add_offset

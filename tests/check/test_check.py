@@ -194,7 +194,7 @@ def test_a_log_without_eit_or_skin_is_checked_too(parts, look):
 def test_a_stream_of_one_sample_does_not_stop_the_check(parts, look):
     parts.presses = None
     parts.streams = {"force": ("force", "N", 10.0, clock(10.0)[:1], np.ones((1, 1)))}
-    has(look(parts), Severity.ERROR, "/streams/force", "fewer than ten")
+    has(look(parts), Severity.ERROR, "/streams/force", "presses are found in 10 or more")
 
 
 def test_a_pressure_in_newtons_is_no_pressure(parts, look):

@@ -534,6 +534,11 @@ LIES = {
     "no press accepted": Lie(
         lambda r: r.pressed(accepted=np.zeros(16, bool), reason=("",) * 16), ERROR, ("all are set aside",)
     ),
+    "most presses set aside": Lie(
+        lambda r: r.pressed(accepted=np.arange(16) > 9, reason=("",) * 16),
+        WARNING,
+        ("/presses", "10 of 16 presses are set aside (accepted = 0)"),
+    ),
     "table 0.3 s late": Lie(table_late(0.3), ERROR, ("/presses", "0.300 s before the presses of the table")),
     "table 0.5 s early": Lie(table_late(-0.5), ERROR, ("/presses", "0.500 s after the presses of the table")),
     "table of another recording": Lie(

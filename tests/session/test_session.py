@@ -367,10 +367,10 @@ def test_a_link_at_the_target_is_replaced_not_followed(tmp_path: Path) -> None:
 
 
 REFUSED_WRITES: dict[str, tuple[Callable[[SessionWriter], object], str]] = {
-    "units": (lambda w: w.add_stream("a", StreamFacts("force", units="g", channels=1, rate_hz=1)), "not SI"),
+    "units": (lambda w: w.add_stream("a", StreamFacts("force", units="g", channels=1, rate_hz=1)), "given in 'g'"),
     "mislabelled": (
         lambda w: w.add_stream("a", StreamFacts("force", units="Pa", channels=1, rate_hz=1)),
-        "force in 'Pa'",
+        "force is given in 'Pa'; convert it to N",
     ),
     "name": (
         lambda w: w.add_stream("../a", StreamFacts("force", units="N", channels=1, rate_hz=1)),
@@ -426,6 +426,7 @@ def test_a_press_table_must_be_sound() -> None:
     for name, value, words in [
         ("x", np.array([0.1]), "unequal length"),
         ("y", np.array([0.1, np.nan]), "row 1"),
+        ("tip_diameter", np.array([0.02, -0.01]), "tip_diameter of row 1 is -0.01 m; give 0, not known, or more"),
         ("t_hold0", np.array([0, 6]), "row 0"),
         ("pad", np.array([0.5, 1.0]), "integers"),
     ]:
@@ -521,7 +522,14 @@ def test_foreign_and_old_hdf5_is_refused(tmp_path: Path) -> None:
         assert words in refusal(tmp_path / "s.h5")
 
 
-@pytest.mark.parametrize(("text", "said"), [('a = "b"\n[c]\n', "looks like TOML"), ("a,b\n1,2\n", "looks like CSV")])
+TEXTS = [
+    ('a = "b"\n[c]\n', "looks like TOML"),
+    ("a,b\n1,2\n", "looks like CSV"),
+    ("<!DOCTYPE html>\n<p>not found\n", "is a web page or XML"),
+]
+
+
+@pytest.mark.parametrize(("text", "said"), TEXTS)
 def test_text_is_told_apart(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "s.h5").write_text(text)
     assert said in refusal(tmp_path / "s.h5")

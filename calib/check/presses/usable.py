@@ -67,6 +67,9 @@ def press_evidence(
         # a log of force alone is fitted sample by sample and needs no presses
         severity = Severity.ERROR if "eit" in streams else Severity.WARNING
         findings.append(Finding(severity, "/presses", what, "see the reasons below and record again"))
+    elif 2 * before < len(presses):
+        what = f"{len(presses) - before} of {len(presses)} presses are set aside (accepted = 0)"
+        findings.append(Finding(Severity.WARNING, "/presses", what, "see the list below; press those places again"))
     elif lost:
         what = f"{lost} of {len(presses)} presses lack samples of a stream and are set aside"
         findings.append(Finding(Severity.WARNING, "/presses", what, "see the list below; press those places again"))

@@ -117,9 +117,14 @@ def _foreign_kind(head: bytes) -> tuple[str, str]:
         return "is a gzip file, not HDF5", "unpack it, or use `jaxeit import csv` for a table"
     if not all(32 <= b < 127 or b in b"\t\r\n" or b >= 128 for b in head):
         return "is not an HDF5 file", sessions
+    if head.lstrip().startswith(b"<"):
+        return "is a web page or XML, not HDF5", "look whether the download failed; " + sessions
     if re.search(rb"^(\[[\w.]+\]|\w+ *= *\S.*)\s*$", head, re.MULTILINE):
         return "is text, not HDF5; it looks like TOML", sessions + "; `jaxeit simulate` makes one of a scene"
     return "is text, not HDF5; it looks like CSV", "use `jaxeit import csv`"
+
+
+BROKEN_OFF = "copy it again; of a recording that broke off, `jaxeit recover` reads the file that ends in .part"
 
 
 def _check_superblock(path: Path, head: bytes) -> None:
@@ -134,11 +139,11 @@ def _check_superblock(path: Path, head: bytes) -> None:
     if (offsets, lengths, base) != (8, 8, 0):
         raise problem(path, "file", "has an unusual HDF5 header", DAMAGED)
     if flags:
-        raise problem(path, "file", "was never closed by its writer", "use `jaxeit recover`")
+        raise problem(path, "file", "was never closed by its writer", BROKEN_OFF)
     size = path.stat().st_size
     if end > size:
         what = f"is truncated: {size:,} of {end:,} bytes are there"
-        raise problem(path, "file", what, "copy it again, or use `jaxeit recover`")
+        raise problem(path, "file", what, BROKEN_OFF)
 
 
 def open_guarded(path: Path) -> h5py.File:
