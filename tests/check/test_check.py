@@ -197,6 +197,16 @@ def test_a_stream_of_one_sample_does_not_stop_the_check(parts, look):
     has(look(parts), Severity.ERROR, "/streams/force", "presses are found in 10 or more")
 
 
+@pytest.mark.parametrize("part", [0, 1], ids=["before", "rising"])
+def test_force_that_is_missing_around_a_press_does_not_stop_the_check(parts, look, part):
+    """NaN before the first press, or as its force rises."""
+    variable, units, rate, time, values = parts.streams["force"]
+    seconds, (begin, full, *_) = time / SECOND, TIMES[0]
+    missing = [seconds <= begin, (seconds >= begin) & (seconds <= full)][part]
+    parts.streams["force"] = (variable, units, rate, time, np.where(missing[:, None], np.nan, values))
+    has(look(parts), Severity.WARNING, "/streams/force", "values are missing")
+
+
 def test_a_pressure_in_newtons_is_no_pressure(parts, look):
     _, _, rate, time, values = parts.streams["pressure"]
     parts.streams["pressure"] = ("force", "N", rate, time, values)

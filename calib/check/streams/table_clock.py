@@ -66,7 +66,7 @@ def _ramp_share(force: StreamStatistics, windows: PressWindows) -> float:
         rest, rise, press = (
             values[slice(*index_ranges(force.time, np.array([w]))[0])] for w in (before, ramp, [ramp[0], hold[1]])
         )
-        if len(rest) and len(rise) and np.isfinite(press).any():
+        if all(np.isfinite(part).any() for part in (rest, rise, press)):
             level = np.nanmedian(rest)
             top = float(np.nanmax(press - level))
             shares.append(float(np.nanmean(rise - level)) / top if top > 0 else 0.0)
