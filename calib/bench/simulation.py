@@ -45,7 +45,8 @@ def simulate(
         progress: wraps the iteration over blocks, such as `tqdm.tqdm`.
 
     Raises:
-        ValueError: if the skin has no pads, the scene cannot be discretised or the file not written.
+        ValueError: if the skin has no pads, the scene cannot be discretised, or the file cannot be written or is larger
+            than the space that is free.
     """
     require_kind(bench, Bench, BenchError, "a Bench", call_on("calib.load_bench", bench), "simulate")
     if not bench.scene.skin.pads:
@@ -54,12 +55,26 @@ def simulate(
     fidelity = SIMULATION if fidelity is None else fidelity
     path = Path(path)
     made = simulated_streams(bench, fidelity)
+    _require_space(made, path)
     store = _BlockStore(path.with_name(path.name + ".part"), _fingerprint(bench, fidelity))
     for name, number, recording in progress(_BlockSequence(made)):
         store.make(name, number, recording)
     _write(made, store, path)
     store.remove()
     return path
+
+
+def _require_space(made: SimulatedStreams, path: Path) -> None:
+    """Refuse a session whose blocks the disk cannot hold, before the first one is simulated."""
+    sizes = {name: 4.0 * recording.samples * len(recording.resting) for name, recording in made}  # single precision
+    folder = next(folder for folder in path.absolute().parents if folder.is_dir())
+    free = shutil.disk_usage(folder).free
+    if sum(sizes.values()) > free:
+        largest = max(sizes, key=sizes.__getitem__)
+        raise BenchError(
+            f"the session takes {sum(sizes.values()) / 1e9:,.3g} GB, and {free / 1e9:,.3g} GB are free; most of it is "
+            f"{largest}: lower its rate, or press fewer places"
+        )
 
 
 class _BlockSequence:

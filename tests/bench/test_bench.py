@@ -287,6 +287,12 @@ def test_a_folder_in_the_way_is_left_alone(skin, tmp_path):
     assert (tmp_path / "s.h5.part" / "thesis.txt").exists()
 
 
+def test_a_session_that_the_disk_cannot_hold_is_not_begun(skin, tmp_path):
+    with pytest.raises(BenchError, match=r"the session takes .* GB are free; most of it is pressure: lower its rate"):
+        simulate(_bench(skin, pad_rate=1e13), tmp_path / "s.h5", fidelity=DRAFT)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_blocks_do_not_show(skin, monkeypatch):
     """Histories handed from block to block are those of one run; only the draws of chance differ."""
