@@ -136,7 +136,7 @@ def pad_masks(skin: Skin, image: AbstractPictured) -> PadMasks:
     Pads that overlap share the pixel equally (a partition of unity).
 
     Raises:
-        FusionError: if the image is not one of pixels, or a pad lies outside it.
+        FusionError: if the image is not one of pixels or is that of another sheet, or a pad lies outside it.
     """
     require_known("pad_masks", FusionError, image)
     if len(image.shape) != 2:
@@ -144,6 +144,7 @@ def pad_masks(skin: Skin, image: AbstractPictured) -> PadMasks:
     x0, x1, y0, y1 = image.extent
     rows, columns = image.shape
     pixel = np.array([(x1 - x0) / columns, (y1 - y0) / rows])
+    _require_sheet(skin, image, pixel)
     low = np.asarray(image.centres, float) - pixel / 2
     masks = [_coverage(pad.outline, low, low + pixel) for pad in skin.pads]
     weights = np.array(masks).reshape(len(skin.pads), len(low))
@@ -153,6 +154,20 @@ def pad_masks(skin: Skin, image: AbstractPictured) -> PadMasks:
             raise FusionError(f"pad {pad.name!r} covers no part of the image")
     weights = weights / np.maximum(weights.sum(0), 1.0)
     return PadMasks(jnp.asarray(weights, image.areas.dtype), image.areas, image.shape)
+
+
+# Of the sheet's width: the mesh of a round sheet reaches nearly to its rim.
+SHEET_TOLERANCE = 0.02
+
+
+def _require_sheet(skin: Skin, image: AbstractPictured, pixel: np.ndarray) -> None:
+    """Refuse an image that spans another rectangle than the skin's sheet; bumps reach half a ``pixel`` beyond it."""
+    spanned, sheet = np.array(image.extent).reshape(2, 2).T, np.array(skin.domain.bounds)
+    if (np.abs(spanned - sheet) > pixel / 2 + SHEET_TOLERANCE * np.ptp(sheet, 0)).any():
+        ends = [f"({x:.3g}, {y:.3g}) to ({u:.3g}, {v:.3g}) m" for (x, y), (u, v) in (spanned, sheet)]
+        raise FusionError(
+            f"the image spans {ends[0]}, but the sheet of {skin.name!r} {ends[1]}; give an image of this skin"
+        )
 
 
 def _coverage(outline: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -255,8 +270,9 @@ def fuse(
         pad_errors: standard errors of the pads' forces, (..., pads) N, for the standard errors of the map.
 
     Raises:
-        FusionError: if the shapes do not fit.
+        FusionError: if the shapes do not fit, or the gate is no number from 0 to 1.
     """
+    require_gate(gate)
     # numbers of Python, of lists too, would be constants of the program: another value would compile it anew
     image, forces = jnp.asarray(image), jnp.asarray(pad_forces)
     pads, pixels = masks.weights.shape
@@ -266,6 +282,15 @@ def fuse(
         )
     errors = None if pad_errors is None else jnp.asarray(pad_errors)
     return _fused(image, masks, forces, jnp.asarray(gate, masks.areas.dtype), contacts, errors)
+
+
+def require_gate(gate: Float[ArrayLike, ""]) -> None:
+    """Refuse a gate that is no number from 0 to 1, unless jit, grad or vmap hides it; raises `FusionError`."""
+    if is_traced(gate):
+        return
+    number = np.asarray(gate)
+    if number.ndim or number.dtype.kind not in "iuf" or not 0 <= number <= 1:
+        raise FusionError(f"gate is {gate!r}; give the smallest concentration of a valid image, 0.5 to 1")
 
 
 @eqx.filter_jit

@@ -9,7 +9,7 @@ import pytest
 
 import jaxeit as je
 
-from .helpers import require_identical
+from .helpers import require_identical, stand_in
 
 
 @pytest.fixture(scope="module")
@@ -113,10 +113,26 @@ def test_shapes_that_do_not_fit_are_refused(skin, model, pixels, masks):
     with pytest.raises(je.fusion.FusionError, match="400 pixels and 4 pads"):
         je.fuse(jnp.zeros(10), masks, jnp.zeros(4))
     away = replace(skin.pads[0], outline=np.array([[1.0, 1.0], [1.1, 1.0], [1.1, 1.1]]))
+    with pytest.raises(je.skin.SkinError, match=r"pad 'lower left': reaches .* beyond the sheet"):
+        replace(skin, pads=(away,))
     with pytest.raises(je.fusion.FusionError, match="lower left"):
-        je.pad_masks(replace(skin, pads=(away,)), pixels)
+        je.pad_masks(stand_in(je.Skin, domain=skin.domain, pads=(away,)), pixels)
     with pytest.raises(je.fusion.FusionError, match=r"basis=Pixels"):
         je.pad_masks(skin, je.Elements().on(model))
+
+
+def test_the_image_of_another_sheet_is_refused(skin, pixels):
+    wide = replace(skin, name="wide", domain=je.Rectangle(0.3, 0.2), pads=())
+    said = r"the image spans \(0, 0\) to \(0.2, 0.2\) m, but the sheet of 'wide' \(0, 0\) to \(0.3, 0.2\) m; give an"
+    with pytest.raises(je.fusion.FusionError, match=said):
+        je.pad_masks(wide, pixels)
+    assert je.pad_masks(replace(skin, domain=je.Rectangle(0.201, 0.2)), pixels).shape == pixels.shape
+
+
+@pytest.mark.parametrize("gate", [-3.0, 1.5, np.nan, "high", [0.6, 0.6]])
+def test_a_gate_is_a_number_from_0_to_1(pixels, masks, gate):
+    with pytest.raises(je.fusion.FusionError, match=r"gate is .*; give the smallest concentration of a valid image"):
+        je.fuse(jnp.zeros(pixels.size), masks, jnp.zeros(4), gate=gate)
 
 
 # --- several contacts on one pad -----------------------------------------------------------------

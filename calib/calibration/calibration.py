@@ -132,8 +132,23 @@ class Calibration:
         return recorded_processing(self.provenance)
 
     def own_pressures(self, pressures: ArrayLike) -> np.ndarray:
-        """The pads' own pressures (n, pads) Pa, without crosstalk, from readings of the pads (n, pads) Pa."""
-        return np.asarray(self.pads.own(jnp.asarray(pressures, self.dtype)))
+        """The pads' own pressures (n, pads) Pa, without crosstalk, from readings of the pads (n, pads) Pa.
+
+        Raises:
+            ValueError: if the readings are not those of so many pads.
+        """
+        return np.asarray(self.pads.own(jnp.asarray(self.pad_rows(pressures), self.dtype)))
+
+    def pad_rows(self, pressures: ArrayLike, name: str = "pressures") -> np.ndarray:
+        """Readings of the pads as rows (n, pads) Pa; those of one time may be (pads,).
+
+        Raises:
+            ValueError: if the readings are not those of so many pads, or not real numbers.
+        """
+        rows, pads = real_rows(pressures, name), len(self.skin.pads)
+        if rows.shape[1:] != (pads,):
+            raise ValueError(f"{name} {rows.shape} do not fit this calibration: give (n, {pads}) Pa")
+        return rows
 
     def pad_forces(
         self, pressures: ArrayLike, places: Places | None = None
@@ -144,8 +159,11 @@ class Calibration:
         includes the uncertainty of the gain. The standard error is that of one reading: of the model, and of the noise
         about it. It leaves out what no press of the calibration showed, such as another tip or a drift since. A force
         is not valid outside the calibrated range of pressure or after a failed fit.
+
+        Raises:
+            ValueError: if the readings are not those of so many pads.
         """
-        return self.pads.pad_forces(pressures, places)
+        return self.pads.pad_forces(self.pad_rows(pressures), places)
 
     def locate(self, frames: ArrayLike, image: Array | None = None, *, single: bool = False) -> Places | None:
         """Places of the contacts in difference frames (n, readings) V; None without a correction by location.
@@ -199,6 +217,15 @@ class Calibration:
             OSError: if the file cannot be written.
         """
         write_archive(path, FORMAT, *to_archive(self))
+
+
+def real_rows(values: ArrayLike, name: str) -> np.ndarray:
+    """Rows of real numbers, of which one may stand by itself; ValueError for complex numbers and for no numbers."""
+    rows = np.atleast_2d(values)
+    if rows.dtype.kind not in "iufb":
+        part = f"; of complex {name} give the real part" if rows.dtype.kind == "c" else ""
+        raise ValueError(f"{name} hold {rows.dtype}: give real numbers{part}")
+    return rows
 
 
 def load_calibration(path: str | Path) -> Calibration:

@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -16,7 +17,7 @@ from ..fitting.fields import Places
 from ..fitting.fields.places import nowhere
 from ..fitting.pad_gains import PadGains
 from ..fitting.pads import PadModel
-from .calibration import Calibration
+from .calibration import Calibration, real_rows
 from .given import require_calibration
 from .localisation.locators import AbstractLocator, locate
 
@@ -94,16 +95,17 @@ def force_map(
         before: the pads' own pressures that came earlier, (m, pads) Pa, for curves with memory; see `remembered`.
 
     Raises:
-        ValueError: if the shapes do not fit the calibration.
+        ValueError: if the shapes do not fit the calibration, or values are not real numbers.
+        FusionError: if the gate is no number from 0 to 1.
     """
     require_calibration(calibration, "force_map", "give calibration.predict(time, values)")
-    frames, pressures = np.atleast_2d(frames), np.atleast_2d(pressures)
-    readings, pads = calibration.recon.readings, len(calibration.skin.pads)
-    if frames.shape[1] != readings or pressures.shape != (len(frames), pads):
-        raise ValueError(
-            f"frames {frames.shape} and pressures {pressures.shape} do not fit this calibration: "
-            f"give (n, {readings}) V and (n, {pads}) Pa"
-        )
+    je.fusion.require_gate(gate)
+    frames, pressures = _changes(calibration, frames, pressures)
+    if before is not None:
+        before = calibration.pad_rows(before, "before")
+    if not len(frames):  # programs are of one row at least
+        row = force_map(calibration, np.zeros((1, frames.shape[1])), np.zeros((1, pressures.shape[1])), gate=gate)
+        return first_rows(row, 0)
     law = law_of(calibration)
     frames = jnp.asarray(frames, law.recon.dtype)
     pressures = jnp.asarray(pressures, law.pads.dtype)
@@ -114,6 +116,24 @@ def force_map(
         places = locate(law.locator, jnp.where(touched, frames, 0), law.recon, law.masks, image)
     found = _fused(law, image, pressures, places, None if earlier is None else jnp.asarray(earlier), gate)
     return ForceEstimate(found.map, *map(np.asarray, found[1:]))
+
+
+def _changes(calibration: Calibration, frames: ArrayLike, pressures: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Frames (n, readings) V and pressures (n, pads) Pa; ValueError if they do not fit the calibration."""
+    frames, pressures = real_rows(frames, "frames"), real_rows(pressures, "pressures")
+    readings, pads = calibration.recon.readings, len(calibration.skin.pads)
+    if frames.shape[1:] != (readings,) or pressures.shape != (len(frames), pads):
+        raise ValueError(
+            f"frames {frames.shape} and pressures {pressures.shape} do not fit this calibration: "
+            f"give (n, {readings}) V and (n, {pads}) Pa"
+        )
+    return frames, pressures
+
+
+def first_rows(found: ForceEstimate, count: int) -> ForceEstimate:
+    """The forces in the first frames."""
+    cut: ForceEstimate = jax.tree.map(lambda part: part[:count], found)
+    return cut._replace(map=replace(cut.map, areas=found.map.areas))
 
 
 def filled(law: ForceLaw, before: np.ndarray | None) -> np.ndarray | None:

@@ -1,10 +1,8 @@
 """Frames of a session in blocks, corrected, with the pressures at their times, and the forces in them."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -14,7 +12,7 @@ from ..presses.streams import resample
 from ..presses.table import Processing
 from ..session import Session, SessionError, Stream
 from .calibration import Calibration
-from .force_maps import ForceEstimate, force_map, is_loaded, law_of
+from .force_maps import ForceEstimate, first_rows, force_map, is_loaded, law_of
 
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
@@ -93,5 +91,4 @@ def _forces(calibration: Calibration, block: FrameBlock, before: np.ndarray) -> 
     count = len(block.time)
     rows = np.minimum(np.arange(BLOCK), count - 1)
     found = force_map(calibration, block.change[rows], block.pressed[rows], before=before)
-    cut: ForceEstimate = jax.tree.map(lambda part: part[:count], found)
-    return cut._replace(map=replace(cut.map, areas=found.map.areas))
+    return first_rows(found, count)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from numbers import Integral
 from pathlib import Path
 
 import jaxeit as je
@@ -87,8 +86,8 @@ class Recipe:
                 if not choice:
                     raise RecipeError(f"recipe: {name} is empty; give one or more to choose from")
         self._require_kinds()
-        if not isinstance(self.folds, Integral) or isinstance(self.folds, bool) or self.folds < 1:
-            raise RecipeError(f"recipe: folds is {self.folds!r}; give a whole number above zero")
+        if not isinstance(self.folds, int) or isinstance(self.folds, bool) or self.folds < 1:
+            raise RecipeError(f"recipe: folds is {self.folds!r}; give a whole number above zero, an int")
         if isinstance(self.imaging.basis, je.model.Elements):
             raise RecipeError("recipe: pads are laid on an image of pixels; choose the basis Pixels or Bumps")
         weight = self.imaging.hyperparameter

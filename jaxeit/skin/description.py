@@ -14,6 +14,7 @@ import numpy as np
 from ..budget import require
 from ..geometry.shapes import Disc, Domain, Polygon, Rectangle
 from ..geometry.surfaces import AbstractSurface, Cylinder, Sphere
+from ..kinds import require_kind
 from ..notebook import Drawing, card
 from ..registry import RegistryError
 from ..toml import TomlError, TomlTable, parse_toml, read_text
@@ -22,12 +23,28 @@ from .patterns import NAMES, named_protocol
 from .protocol import Protocol, ProtocolError
 
 
+class SkinError(ValueError):
+    """Hardware that cannot be; the message names the part."""
+
+
 @dataclass(frozen=True, eq=False)
 class Pad:
-    """One air-tight pad: its name and its outline, (corners, 2) m, counter-clockwise."""
+    """One air-tight pad: its name and its outline, (corners, 2) m, counter-clockwise.
+
+    Raises:
+        SkinError: for an outline that is none, such as a shape of the sheet, or that crosses itself.
+    """
 
     name: str
     outline: np.ndarray
+
+    def __post_init__(self) -> None:
+        require_kind(self.outline, (np.ndarray, Sequence), SkinError, "an outline", _CORNERS, f"pad {self.name!r}")
+        try:
+            Polygon(self.outline)
+        except (TypeError, ValueError) as error:
+            raise SkinError(f"pad {self.name!r}: {error}") from None
+        object.__setattr__(self, "outline", np.asarray(self.outline, float))
 
     @property
     def area(self) -> float:
@@ -35,12 +52,9 @@ class Pad:
         return Polygon(self.outline).area
 
 
+_CORNERS = "its corners [[x, y], ...] in m; those of a Rectangle or Polygon are its corner_points"
 MAX_OVERLAP = 0.9  # of the smaller of two pads: more is one pad that is listed twice
 BOX_POINTS = 40  # along each side of a box that is examined
-
-
-class SkinError(ValueError):
-    """Hardware that cannot be; the message names the part."""
 
 
 def _require_apart(pads: Sequence[Pad]) -> None:
@@ -104,7 +118,7 @@ class Skin:
 
     Raises:
         ProtocolError: for a protocol of more electrodes.
-        SkinError: for a sheet that does not conduct, and for pads of one name or over one another.
+        SkinError: for a sheet that does not conduct, and for pads beside the sheet, of one name or over one another.
     """
 
     name: str
@@ -121,6 +135,9 @@ class Skin:
         self.protocol.check(len(self.electrodes))
         if not 0 < self.sheet_resistance < math.inf:
             raise SkinError(f"sheet_resistance is {self.sheet_resistance}; give ohm per square, above zero")
+        for pad in self.pads:
+            if why := _misfit(pad, self.domain):
+                raise SkinError(f"pad {pad.name!r}: {why}")
         _require_apart(self.pads)
 
     @property
@@ -284,19 +301,25 @@ def _pad(table: TomlTable, domain: Domain) -> Pad:
     else:
         corners = "rectangle = [x0, y0, x1, y1] in m, or polygon = [[x, y], ...]"
         outline = Polygon(table.array(key, 2, corners)).corner_points
-    low, high = np.asarray(domain.bounds)
-    beyond = np.maximum(low - np.min(outline, 0), np.max(outline, 0) - high)
-    if (beyond > _PAD_REACH * (high - low)).any():
-        raise table.error(key, f"reaches {beyond.max():.3g} m beyond the sheet; give its corners in m")
-    if (size := np.ptp(outline, 0).min()) < _MIN_PAD_WIDTH * (high - low).min():
-        sides = " x ".join(f"{side:g}" for side in high - low)
-        what = f"is {size:.3g} m wide, too little for a pad of this sheet of {sides} m"
-        raise table.error(key, f"{what}; give all lengths in m")
     table.done()
-    pad = Pad(name, np.asarray(outline, float))
-    if not _meets(pad, domain):
-        raise table.error(key, "no part of the pad lies on the sheet; give its corners in m, from the sheet's origin")
+    pad = Pad(name, outline)
+    if why := _misfit(pad, domain):
+        raise table.error(key, why)
     return pad
+
+
+def _misfit(pad: Pad, domain: Domain) -> str:
+    """Why a pad cannot be one of a sheet, and what to give; empty if it can."""
+    low, high = np.asarray(domain.bounds)
+    beyond = np.maximum(low - np.min(pad.outline, 0), np.max(pad.outline, 0) - high)
+    if (beyond > _PAD_REACH * (high - low)).any():
+        return f"reaches {beyond.max():.3g} m beyond the sheet; give its corners in m"
+    if (size := np.ptp(pad.outline, 0).min()) < _MIN_PAD_WIDTH * (high - low).min():
+        sides = " x ".join(f"{side:g}" for side in high - low)
+        return f"is {size:.3g} m wide, too little for a pad of this sheet of {sides} m; give all lengths in m"
+    if not _meets(pad, domain):
+        return "no part of the pad lies on the sheet; give its corners in m, from the sheet's origin"
+    return ""
 
 
 def _meets(pad: Pad, domain: Domain) -> bool:

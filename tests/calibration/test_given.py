@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import calib
@@ -80,3 +81,31 @@ def test_the_path_of_a_table_may_be_a_text():
     assert spec.paths == (Path("a.csv"), Path("b.csv"))
     with pytest.raises(SessionError, match=r"following: 'b.csv' is a path, and not a list of paths; give \['b.csv'\]"):
         importers.FileSpec("a.csv", "t", "ms", (), following="b.csv")
+
+
+def test_forces_of_no_frames_are_no_rows(calibration):
+    readings = calibration.recon.readings
+    found = calib.force_map(calibration, np.zeros((0, readings)), np.zeros((0, 4)))
+    assert found.force.shape == found.valid.shape == (0, 4)
+    assert found.map.force.shape == (0, 400)
+    assert found.map.areas.shape == (400,)
+
+
+def test_what_is_no_change_of_frames_and_pads_is_named(calibration):
+    frames, pads = np.zeros((2, calibration.recon.readings)), np.zeros((2, 4))
+    with pytest.raises(ValueError, match=r"frames hold complex128: give real numbers; of complex frames give the real"):
+        calib.force_map(calibration, frames + 1j, pads)
+    with pytest.raises(ValueError, match=r"before \(3, 3\) do not fit this calibration: give \(n, 4\) Pa"):
+        calib.force_map(calibration, frames, pads, before=np.zeros((3, 3)))
+    with pytest.raises(je.fusion.FusionError, match=r"gate is -3"):
+        calib.force_map(calibration, frames, pads, gate=-3)
+    for of in (calibration.pad_forces, calibration.own_pressures):
+        with pytest.raises(ValueError, match=r"pressures \(1, 3\) do not fit this calibration: give \(n, 4\) Pa"):
+            of(np.ones(3))
+
+
+def test_pressures_of_one_time_are_one_row(calibration):
+    force, error, valid = calibration.pad_forces(np.full(4, 500.0))
+    assert force.shape == error.shape == valid.shape == (1, 4)
+    np.testing.assert_array_equal(force, calibration.pad_forces(np.full((1, 4), 500.0))[0])
+    np.testing.assert_array_equal(calibration.own_pressures(np.full(4, 500.0)), np.full((1, 4), 500.0))

@@ -41,6 +41,13 @@ def test_windows_hold_touched_frames_of_the_length_asked_for():
     assert WindowedFrames(1.0, 2).quiet.noise is None
 
 
+@pytest.mark.parametrize("seconds", [0, -1.0, np.nan, np.inf, "1", None])
+def test_windows_have_a_duration(seconds):
+    said = r"loads: windows of .* s; give a duration in s, a finite number above zero"
+    with pytest.raises(je.registry.SettingError, match=said):
+        WindowedFrames(seconds, 2)
+
+
 class Asked(Exception):
     """The fit of loads is prepared."""
 

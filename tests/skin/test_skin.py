@@ -341,3 +341,22 @@ def test_a_skin_is_the_same_whatever_its_text(skin):
         *(je.skin.parse_skin(TEXT.replace(*change)) for change in (("radius = 0.003", "radius = 0.0031"),)),
     ]
     assert len({mark, *map(je.skin.skin_hash, others)}) == 1 + len(others)
+
+
+@pytest.mark.parametrize(
+    ("outline", "said"),
+    [
+        (((3, 3), (4, 3), (4, 4)), "pad 'a': reaches 3.8 m beyond the sheet; give its corners in m"),
+        (((0.3, 0.1), (0.4, 0.1), (0.4, 0.2)), "pad 'a': no part of the pad lies on the sheet"),
+        (((0.0, 0.0), (1e-5, 0.0), (1e-5, 0.1)), "pad 'a': is 1e-05 m wide, too little for a pad"),
+        (((0.0, 0.0), (0.1, 0.1), (0.1, 0.0), (0.0, 0.1)), "pad 'a': Polygon: the sides from vertices 0 and 2 meet"),
+        (
+            je.Rectangle(5, 5),
+            r"pad 'a': Rectangle is not an outline; give its corners \[\[x, y\], ...\] in m; those of",
+        ),
+        ("abc", "pad 'a': "),
+    ],
+)
+def test_pads_from_python_are_asked_as_those_of_files(skin, outline, said):
+    with pytest.raises(je.skin.SkinError, match=f"^{said}"):
+        replace(skin, pads=(je.Pad("a", np.array(outline) if isinstance(outline, tuple) else outline),))

@@ -5,6 +5,7 @@ without contact, and the noise is theirs, so that the fit knows the coat as it i
 the pads tell; the fit divides it.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from jaxtyping import Float
 
 import jaxeit as je
 from jaxeit.contacts import LoadKind, Loads, LoadSettings, Proposal
+from jaxeit.registry import SettingError
 
 from ...presses.streams import finite_mean
 from ..calibration import Calibration
@@ -44,9 +46,15 @@ class Window(NamedTuple):
 
 
 class WindowedFrames:
-    """Collects windows of touched frames, and the frames without contact, block by block."""
+    """Collects windows of touched frames, and the frames without contact, block by block.
+
+    Raises:
+        SettingError: for windows whose duration is no finite number above zero.
+    """
 
     def __init__(self, seconds: float, readings: int):
+        if not isinstance(seconds, int | float | np.number) or not 0 < seconds < math.inf:
+            raise SettingError(f"loads: windows of {seconds!r} s; give a duration in s, a finite number above zero")
         self._length = round(1e9 * seconds)
         self.windows: list[Window] = []
         self._open: list[tuple[int, np.ndarray, float, np.ndarray]] = []
