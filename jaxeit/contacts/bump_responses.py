@@ -28,6 +28,8 @@ from ..model.discretisation import Model
 
 # c and d above: part of the second order, and its saturation.
 SECOND_ORDER, SATURATION = 0.8, 0.7
+# Distance, in widths, beyond which a bump is nothing: exp(-18) of its height. Rows of nodes that are computed together.
+REACH, ROWS = 6.0, 8
 # Pitch of the table in log width.
 WIDTH_PITCH = 0.25
 
@@ -128,17 +130,35 @@ def nodes_of(model: Model, widths: tuple[float, float], columns: int) -> Nodes:
 
 
 def tabulate(model: Model, jacobian: np.ndarray, nodes: Nodes) -> np.ndarray:
-    """Responses at the nodes, (ny, nx, nw, r): the Jacobian times the means of the bumps over the elements."""
-    shape = [len(axis) for axis in nodes.axes]
-    out = np.empty((*shape, len(jacobian)))
-    for level, log_width in enumerate(nodes.axes[2]):
-        width = np.exp(log_width)
+    """Responses at the nodes, (ny, nx, nw, r): the Jacobian times the means of the bumps over the elements.
+
+    Rows of nodes are computed together with the elements that their bumps reach.
+    """
+    y, x, log_widths = nodes.axes
+    out = np.empty((len(y), len(x), len(log_widths), len(jacobian)))
+    middle, size = _heights(model)
+    order = np.argsort(middle)
+    middle, jacobian = middle[order], jacobian[:, order]
+    for level, width in enumerate(np.exp(log_widths)):
         points, weights = points_of(model, width)
-        along = [np.exp(-0.5 * ((points[..., 1 - k, None] - nodes.axes[k]) / width) ** 2) for k in (0, 1)]
-        means = (along[0] * weights[:, None]).swapaxes(1, 2) @ along[1]  # (elements, y, x)
-        found = jacobian @ means.reshape(len(means), -1)
-        out[:, :, level] = (nodes.scale / width) ** 2 * np.moveaxis(found.reshape(-1, *shape[:2]), 0, -1)
+        column, row = points[order].transpose(2, 0, 1)
+        across = np.exp(-0.5 * ((column[..., None] - x) / width) ** 2) * weights[:, None]
+        for first in range(0, len(y), ROWS):
+            some = y[first : first + ROWS]
+            far = REACH * width + size
+            near = slice(*np.searchsorted(middle, [some[0] - far, some[-1] + far]))
+            along = np.exp(-0.5 * ((row[near, None] - some[:, None]) / width) ** 2)
+            means = along @ across[near]  # (elements, rows, x)
+            found = jacobian[:, near] @ means.reshape(len(means), -1)
+            part = np.moveaxis(found.reshape(-1, len(some), len(x)), 0, -1)
+            out[first : first + ROWS, :, level] = (nodes.scale / width) ** 2 * part
     return out
+
+
+def _heights(model: Model) -> tuple[np.ndarray, float]:
+    """Middles of the elements along y, and the largest extent of one, m."""
+    corners = np.asarray(model.chart, float)[np.asarray(model.triangles), 1]
+    return corners.mean(1), float(np.ptp(corners, axis=1).max())
 
 
 # Symmetric rule of degree 4 on a triangle (Dunavant 1985): barycentric coordinates and weights.

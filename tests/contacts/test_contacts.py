@@ -9,6 +9,7 @@ from scipy.stats import binom
 
 import jaxeit as je
 from jaxeit.contacts import ContactResult, ContactSettings, prepare_contacts, refine_contacts, search, strongest
+from jaxeit.contacts.bump_responses import nodes_of, points_of, tabulate
 from jaxeit.imaging.noise import InverseError
 
 from ..helpers import spread_stacks
@@ -314,3 +315,16 @@ def test_a_contact_over_a_dead_electrode_is_found_there(finder, other, skin):
     dead = np.argmin(np.linalg.norm(skin.electrode_positions - centre, axis=1))
     dv = np.where((skin.protocol.pattern == dead).any(1), np.nan, _touched(other, 0.4 * _bump(other, centre, 0.012)))
     np.testing.assert_allclose(_find(finder, dv)[0].position[0], centre, atol=2e-3)
+
+
+def test_a_table_of_responses_is_the_sum_over_all_elements(model):
+    """Elements that a bump does not reach are left out of its row."""
+    nodes = nodes_of(model, (0.005, 0.03), 17)
+    slopes = np.random.default_rng(0).normal(size=(3, len(model.triangles)))
+    found = tabulate(model, slopes, nodes)
+    for i, j, level in [(0, 0, 0), (7, 3, 1), (8, 16, 4), (16, 9, len(nodes.axes[2]) - 1)]:
+        centre, width = np.array([nodes.axes[1][j], nodes.axes[0][i]]), np.exp(nodes.axes[2][level])
+        points, weights = points_of(model, width)
+        height = np.exp(-0.5 * ((points - centre) ** 2).sum(-1) / width**2) @ weights
+        expected = (nodes.scale / width) ** 2 * slopes @ height
+        np.testing.assert_allclose(found[i, j, level], expected, rtol=0, atol=1e-7 * np.abs(found[..., level, :]).max())
