@@ -16,6 +16,7 @@ from .eit.reading_order import OrderCheck
 from .eit.readings import check_eit
 from .electrodes import check_electrodes
 from .evidence import PressEvidence
+from .logs.findings import log_findings
 from .presses.force import force_findings, is_silent
 from .presses.pad_responses import pad_response_findings
 from .presses.pads import check_pads
@@ -66,6 +67,8 @@ def check_session(
     pads = check_pads(statistics, skin, findings)
     places = check_electrodes(skin, channels, order, findings) if electrodes else ()
     onsets = _compare(session, statistics, evidence, skin, channels, order, findings)
+    if "eit" not in session.streams:
+        findings += log_findings(statistics, session.simulated)
     return CheckReport(
         name=session.name,
         title=session.title,

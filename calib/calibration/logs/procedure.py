@@ -18,6 +18,7 @@ from jaxeit.budget import current_budget
 from jaxeit.kinds import require_kind
 
 from ...check.acceptance import accept
+from ...check.logs.blocks import NOT_SIGNALS, signal_name
 from ...fitting.curves import CURVES, AbstractCurve
 from ...fitting.fields import FIELDS, AbstractField, PadEdge
 from ...fitting.logs import (
@@ -45,7 +46,6 @@ from .evaluation import LogEvaluation, log_evaluation
 from .storage import location_name
 
 FORCE_FORMAT = "log-forces"
-_NOT_SIGNALS = ("force", "stage", "temperature", "barometer")
 Log = tuple[np.ndarray, np.ndarray, np.ndarray]  # times (n,) ns, values (n, channels), force (n,) N
 
 
@@ -197,15 +197,14 @@ def _same_signal(sessions: Sequence[Session]) -> Stream:
 
 
 def _signal(session: Session) -> Stream:
-    if "pressure" in session.streams:
-        return session.streams["pressure"]
-    left = [name for name in session.streams if name not in _NOT_SIGNALS]
-    if len(left) != 1:
+    name = signal_name(session.streams)
+    if not name:
+        left = [stream for stream in session.streams if stream not in NOT_SIGNALS]
         raise FitError(
             f"{session.name}: which stream is the signal? found {', '.join(left) or 'none'}; import "
             "it under the name pressure"
         )
-    return session.streams[left[0]]
+    return session.streams[name]
 
 
 def _unit(signal: Stream) -> str:
