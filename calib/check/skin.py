@@ -28,10 +28,20 @@ def check_skin(session: Session, given: je.Skin | None, findings: list[Finding])
         findings += _differences(own.toml, je.load_skin(own.name).toml, f"the shipped {own.name!r}")
     skin = own if given is None else given
     if skin is not None:
-        findings += _size_findings(skin)
-        findings += _overlap_findings(skin)
+        findings += skin_findings(skin)
         findings += _protocol_findings(session, skin)
     return skin
+
+
+def skin_findings(skin: je.Skin) -> Iterator[Finding]:
+    """What a skin describes that can hardly be: sizes, pads over one another, readings that are taken twice."""
+    yield from _size_findings(skin)
+    yield from _overlap_findings(skin)
+    rows, count = np.unique(np.asarray(skin.protocol.pattern), axis=0, return_counts=True)
+    if (count > 1).any():
+        twice = ", ".join(map(str, rows[count > 1][0].tolist()))
+        what = f"{(count > 1).sum()} of {len(rows)} readings are taken more than once, as that of electrodes {twice}"
+        yield Finding(Severity.WARNING, "/device", what, "name each reading once: a second one tells no new place")
 
 
 def _own_skin(session: Session, findings: list[Finding]) -> je.Skin | None:

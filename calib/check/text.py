@@ -18,7 +18,7 @@ def render(report: CheckReport, verbose: bool = False) -> str:
     """The report as text of fewer than 100 columns; ``verbose`` lists every reading of the scan."""
     parts: list[Iterable[str]] = [
         _head(report),
-        _findings(report.findings),
+        findings_text(report.findings),
         _streams(report.streams),
         _pads(report.pads),
         _presses(report),
@@ -41,7 +41,8 @@ def _head(report: CheckReport) -> Iterator[str]:
     yield ", ".join(marks)
 
 
-def _findings(findings: Sequence[Finding]) -> Iterator[str]:
+def findings_text(findings: Sequence[Finding]) -> Iterator[str]:
+    """Lines of findings and of what to do about them, the worst first."""
     for finding in sorted(findings, key=lambda f: -f.severity):
         label = "note" if finding.severity is Severity.OK else finding.severity.name
         yield from _wrapped(f"{label:<8} ", f"{finding.where}: {finding.what}")

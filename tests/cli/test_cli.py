@@ -157,6 +157,17 @@ def test_check_of_a_skin_file(tmp_path, skin, capsys):
     assert f"{path}: electrode 0 (disc at (20.00, 20.00) mm) of radius 30.00 mm is" in capsys.readouterr().err
 
 
+def test_check_of_a_skin_file_says_what_can_hardly_be(tmp_path, skin, capsys):
+    rows = "rows = [[0, 1, 2, 3], [1, 2, 3, 4], [0, 1, 2, 3]]"
+    aside = skin.toml.replace('pattern = "adjacent"', rows).replace("[0.1, 0.1, 0.2, 0.2]", "[0.05, 0.1, 0.2, 0.2]")
+    (tmp_path / "mine.toml").write_text(aside)
+    assert main(["check", str(tmp_path / "mine.toml")]) == 0
+    said = capsys.readouterr().out
+    assert "1 of 2 readings are taken more than once, as that of electrodes 0, 1, 2, 3" in said
+    assert "50 % of pad 'upper left' or 'upper right' lie within the other one" in said
+    assert "Nothing wrong" not in said
+
+
 def test_check_of_the_bundled_sessions(bundled, capsys):
     assert main(["check", *map(str, bundled)]) == 0
     assert "SIMULATED" in capsys.readouterr().out

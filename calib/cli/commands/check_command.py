@@ -61,6 +61,9 @@ def _described(path: str) -> str:
     """What a skin's file describes, and what its model reads without contact, in words."""
     import jaxeit as je
 
+    from ...check.skin import skin_findings
+    from ...check.text import findings_text
+
     skin = je.load_skin(path)
     try:
         model = je.discretise(je.Scene(skin, effects=()), je.Fidelity.draft())
@@ -70,12 +73,13 @@ def _described(path: str) -> str:
     low, high = skin.domain.bounds
     width, height = (1e3 * (end - start) for start, end in zip(low, high, strict=True))
     pads = ", ".join(pad.name for pad in skin.pads) or "none"
+    doubts = "\n".join(findings_text(list(skin_findings(skin))))
     return (
         f"{path}: skin {skin.name}, {width:.4g} x {height:.4g} mm\n"
         f"{len(skin.electrodes)} electrodes; pads: {pads}\n"
         f"{len(readings)} readings in {1e3 * skin.protocol.frame_time:.3g} ms; without contact "
         f"{readings.min():.3g} to {readings.max():.3g} mV\n"
-        "Nothing wrong was found."
+        f"{doubts or 'Nothing wrong was found.'}"
     )
 
 
