@@ -151,10 +151,13 @@ def render_evaluation(evaluation: LogEvaluation, title: str = "") -> str:
     """The results as lines for a terminal."""
     s = evaluation.summary()
     each = ", ".join(f"{name} {_percent(s[f'coverage_{name}'])}" for name in THIRDS)
+    relative = (
+        f" = {s['force_rmse_percent_full_scale']:.1f} % of the largest force, MAPE {s['force_mape']:.1f} % "
+        f"(forces above {RELATIVE_FROM:.0%} of the largest)"
+    )
+    known = np.isfinite(s["force_mape"])  # of forces that are all zero there is no percentage
     errors = (
-        f"  force RMSE {s['force_rmse']:.3f} N = {_percent(s['force_rmse_percent_full_scale'] / 100)} of the largest "
-        f"force, MAPE {_percent(s['force_mape'] / 100)} (forces above {RELATIVE_FROM:.0%} of the largest), "
-        f"bias {s['force_bias']:+.3f} N",
+        f"  force RMSE {s['force_rmse']:.3f} N{relative if known else ''}, bias {s['force_bias']:+.3f} N",
         f"  within the 90 % interval: {_percent(s['coverage'])} of samples; by third of force: {each}",
         f"  outside the calibrated range: {_percent(s['outside_share'])} of samples",
     )

@@ -28,7 +28,7 @@ def unrelated_finding(log: LogBlocks) -> Iterator[Finding]:
     parts = float(np.median(np.abs(log.correlations), axis=1).max())
     if max(whole, parts) >= NO_RELATION or max(_lagged(column, log.force) for column in columns.T) >= LAGGED:
         return
-    what = f"does not follow the force: their rank correlation is {whole:.2f}"
+    what = f"no channel follows the force: their largest rank correlation is {whole:.2f}"
     remedy = "check the sensor, its tube and its cable, and which columns were imported"
     yield Finding(Severity.ERROR, f"/streams/{log.signal}", what, remedy)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..parts import Part, flagged_part, stepped_part
 from ..report import Finding, Severity
-from .blocks import LogBlocks, usual
+from .blocks import BLOCKS, LogBlocks, usual
 from .following import RELATED, goes_on
 
 MIN_RATIO = 4.0  # of a change of gain: friction, creep and wear change it by less
@@ -19,7 +19,7 @@ MIN_STEP_SCATTERS = 5.0  # of the gains of the blocks in both parts
 MIN_COMPARED, MIN_SHARE = 6, 0.75  # blocks in which a channel follows the force, and their share of those with force
 MIN_OVERLAP = 0.5  # of the wider range of both parts, in which levels are compared
 NORMAL = 0.3  # of the usual spread, from which the sign of a block counts
-MIN_AGREEING = 0.8  # of the channels that follow the force: their gains change together if the force is wrong
+MIN_AGREEING, MIN_SHOWING = 0.8, 0.6  # of the channels that follow the force, and of all, that change together
 
 
 class _Change(NamedTuple):
@@ -36,17 +36,30 @@ class _Change(NamedTuple):
 
 
 def gain_findings(log: LogBlocks) -> Iterator[Finding]:
-    """Changes of the gain or the sign: of the force or of all channels if most of them agree, otherwise of some."""
-    changes = {k: found for k in range(len(log.column)) if (found := _sign_change(log, k) or _gain_change(log, k))}
-    follow = sum(bool(_related(log, k).any()) for k in range(len(log.column)))
+    """Changes of the gain or the sign that most channels show, of the force or of all channels; signs also of one."""
+    channels = range(len(log.column))
+    changes = {k: found for k in channels if (found := _sign_change(log, k) or _gain_change(log, k))}
+    follow = sum(bool(_related(log, k).any()) for k in channels)
     sure = Severity.WARNING if log.placed else Severity.ERROR  # at other places a channel may have another gain
     for of_force, subject in ((True, "force"), (False, log.signal)):
-        alike = [change for change in changes.values() if change.of_force == of_force]
-        if alike and len(alike) >= MIN_AGREEING * follow:
+        alike = _agreeing([change for change in changes.values() if change.of_force == of_force])
+        if len(alike) >= max(MIN_AGREEING * follow, MIN_SHOWING * len(channels)):
             yield _finding(log, alike[0], f"the {subject}", f"/streams/{subject}", sure)
             return
     for k, change in changes.items():
-        yield _finding(log, change, f"column {log.column[k]}", f"/streams/{log.signal}", Severity.WARNING)
+        if change.ratio < 0:  # a gain may be one of pads that are pressed in turn
+            yield _finding(log, change, f"column {log.column[k]}", f"/streams/{log.signal}", Severity.WARNING)
+
+
+def _agreeing(changes: list[_Change]) -> list[_Change]:
+    """Those of the usual ratio, at the usual time or a block beside it."""
+    if not changes:
+        return []
+    ratios, begins = np.array([(change.ratio, change.times[change.part.row]) for change in changes]).T
+    near = np.abs(begins - np.median(begins)) <= np.ptp(changes[0].times) / (BLOCKS - 2)
+    usual_ratio = float(np.median(ratios))
+    near &= (ratios / usual_ratio > 1 / MIN_RATIO) & (ratios / usual_ratio < MIN_RATIO)
+    return [change for change, is_near in zip(changes, near, strict=True) if is_near]
 
 
 def _finding(log: LogBlocks, change: _Change, subject: str, where: str, severity: Severity) -> Finding:

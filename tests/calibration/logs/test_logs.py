@@ -9,7 +9,7 @@ import pytest
 import calib
 from calib.calibration.archives.storage import SEAL, seal
 from calib.calibration.logs.calibration import FORMAT
-from calib.calibration.logs.evaluation import log_evaluation
+from calib.calibration.logs.evaluation import log_evaluation, render_evaluation
 from calib.calibration.logs.procedure import FORCE_FORMAT, apply_log, calibrate_logs, evaluate_log, render_log
 from calib.calibration.logs.storage import CURVE_FIELDS
 from calib.cli import main
@@ -299,6 +299,13 @@ def test_what_is_missing_is_named(force, predicted, said):
     missing = log_evaluation("by hand", np.arange(2.0), np.array(force), found).missing
     assert missing.startswith(said)
     assert bool(missing) == bool(said)
+
+
+def test_errors_of_forces_that_are_all_zero_have_no_percentage():
+    found = LogPrediction(np.ones(4), *np.ones((3, 4)), np.ones(4, bool))
+    said = render_evaluation(log_evaluation("at rest", np.arange(4.0), np.zeros(4), found))
+    assert "force RMSE 1.000 N, bias +1.000 N" in said
+    assert "nan" not in said
 
 
 @pytest.mark.parametrize(("error", "noted"), [(0.5, False), (3.0, True)])
