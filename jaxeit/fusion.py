@@ -32,6 +32,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import DTypeLike
 
 from ._compile import full_precision, is_traced, require_known
+from .kinds import is_number, shown
 from .model.bases import AbstractPictured, overlap_areas
 from .notebook import card, picture
 from .skin.description import Skin
@@ -288,9 +289,8 @@ def require_gate(gate: Float[ArrayLike, ""]) -> None:
     """Refuse a gate that is no number from 0 to 1, unless jit, grad or vmap hides it; raises `FusionError`."""
     if is_traced(gate):
         return
-    number = np.asarray(gate)
-    if number.ndim or number.dtype.kind not in "iuf" or not 0 <= number <= 1:
-        raise FusionError(f"gate is {gate!r}; give the smallest concentration of a valid image, 0.5 to 1")
+    if not is_number(gate) or not 0 <= np.asarray(gate) <= 1:
+        raise FusionError(f"gate is {shown(gate)}; give the smallest concentration of a valid image, 0.5 to 1")
 
 
 @eqx.filter_jit

@@ -1,7 +1,9 @@
-"""One message for what stands in the place of something else: a name, a path, a class, or an object of another kind."""
+"""What stands in the place of something else: a name, a path, a class, or an object of another kind."""
 
 import os
 from typing import Any
+
+import numpy as np
 
 
 def stated(value: Any) -> str:
@@ -9,6 +11,16 @@ def stated(value: Any) -> str:
     if isinstance(value, str | os.PathLike):
         return repr(os.fspath(value))
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is one real number, of Python, NumPy or JAX; a text, None and True are none."""
+    return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
+
+
+def shown(value: Any) -> str:
+    """A wrong number as a message shows it: a text in quotes, which looks like a number otherwise."""
+    return str(value) if is_number(value) else repr(value)
 
 
 def require_kind(

@@ -34,6 +34,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer, Real, Shaped
 
 from ._compile import full_precision, is_traced, verb
+from .kinds import stated
 from .registry import AbstractChoice, limited
 
 __all__ = [
@@ -101,7 +102,7 @@ class Peak(AbstractEstimator):
     """The pixel with the largest value."""
 
     def __call__(self, image: Float[ArrayLike, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
-        return _peak(jnp.asarray(image), recon.centres)
+        return _peak(_on_pixels(image, recon), recon.centres)
 
 
 class LevelCentroid(AbstractEstimator):
@@ -114,7 +115,7 @@ class LevelCentroid(AbstractEstimator):
     level: float = limited(0.25, above=0, most=1)
 
     def __call__(self, image: Float[ArrayLike, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
-        image = jnp.asarray(image)
+        image = _on_pixels(image, recon)
         return _level_centroid(image, recon.centres, recon.areas, jnp.asarray(self.level, image.dtype))
 
 
@@ -126,7 +127,17 @@ class PositiveCentroid(AbstractEstimator):
     """
 
     def __call__(self, image: Float[ArrayLike, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
-        return _positive_centroid(jnp.asarray(image), recon.centres, recon.areas)
+        return _positive_centroid(_on_pixels(image, recon), recon.centres, recon.areas)
+
+
+def _on_pixels(image: Float[ArrayLike, "... pixels"], recon: Pictured) -> Float[Array, "... pixels"]:
+    """The image, (..., pixels); MetricError unless it is one of the pixels of ``recon``."""
+    if not hasattr(recon, "centres"):
+        raise MetricError(f"{stated(recon)} has no pixels; give a reconstructor, or Pixels(20).on(model)")
+    image, pixels = jnp.asarray(image), len(recon.centres)
+    if image.shape[-1:] != (pixels,):
+        raise MetricError(f"image of shape {image.shape}; give (..., {pixels}), one number for each pixel of recon")
+    return image
 
 
 @verb
@@ -167,8 +178,22 @@ ESTIMATORS: dict[str, AbstractEstimator] = {
 
 
 def localisation_error(estimated: Places, true: Places) -> Float[Array, "..."]:
-    """Distance between estimated and true positions, (..., 2) m each; (...) m, with a gradient of zero at zero."""
-    return _length(jnp.asarray(estimated) - jnp.asarray(true))
+    """Distance between estimated and true positions, (..., 2) m each; (...) m, with a gradient of zero at zero.
+
+    Raises:
+        MetricError: if the positions are not pairs, or as many of them as fit each other.
+    """
+    found, wanted = jnp.asarray(estimated), jnp.asarray(true)
+    try:
+        np.broadcast_shapes(found.shape, wanted.shape)
+        pairs = found.shape[-1:] == wanted.shape[-1:] == (2,)
+    except ValueError:
+        pairs = False
+    if not pairs:
+        raise MetricError(
+            f"positions of shapes {found.shape} and {wanted.shape}; give (..., 2) m, as many true as estimated ones"
+        )
+    return _length(found - wanted)
 
 
 @verb

@@ -428,3 +428,19 @@ def test_otsu_under_jit_and_vmap_keeps_its_precision(dtype):
     for row, each in zip(found, values, strict=True):
         # Programs compiled apart may round apart.
         np.testing.assert_allclose(row, otsu_thresholds(each), rtol=0, atol=8 * np.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS.values(), ids=ESTIMATORS)
+def test_an_image_of_other_pixels_is_refused(estimator):
+    grid = Grid(np.zeros((9, 2)), np.ones(9))
+    said = r"image of shape \(2, 4\); give \(..., 9\), one number for each pixel of recon"
+    with pytest.raises(MetricError, match=said):
+        estimator(np.ones((2, 4)), grid)
+    with pytest.raises(MetricError, match=r"Pixels has no pixels; give a reconstructor, or Pixels\(20\)"):
+        estimator(np.ones((2, 4)), je.Pixels(2))
+
+
+@pytest.mark.parametrize("shapes", [((3, 2), (4, 2)), ((3,), (3,)), ((), (2,)), ((5, 3), (5, 2))])
+def test_positions_that_do_not_fit_each_other_are_refused(shapes):
+    with pytest.raises(MetricError, match=r"positions of shapes .*; give \(..., 2\) m, as many true as estimated ones"):
+        localisation_error(*map(np.zeros, shapes))

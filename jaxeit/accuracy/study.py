@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from ..model.bases import AbstractBasis, Pixels
+from ..model.discretisation import require_scene
 from ..model.fidelity import Fidelity
 from ..model.scene import Scene
 from ..model.sensitivity import jacobian
@@ -50,9 +51,11 @@ def ladder(
         progress: wraps each pass over the rungs.
 
     Raises:
+        SceneError: if ``scene`` is no scene, such as a skin or a name.
         LadderError: if there are no rungs or touches, labels repeat, or the reference has a rung's mesh.
         FidelityError: if JAX is in 32-bit mode: the reference needs float64.
     """
+    require_scene(scene)
     choices = tuple(fidelity_choices() + image_choices() if rungs is None else rungs)
     touches = tuple(default_touches(scene.skin) if touches is None else touches)
     pair = _reference_of(choices) if reference is None else reference

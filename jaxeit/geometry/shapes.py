@@ -15,6 +15,7 @@ from jaxtyping import Array
 from numpy.typing import ArrayLike
 
 from ..budget import require
+from ..kinds import is_number, shown
 
 Vectors = TypeVar("Vectors", np.ndarray, Array)
 
@@ -218,7 +219,7 @@ class Disc(Domain):
 
     def __post_init__(self) -> None:
         _require_positive("Disc", radius=self.radius)
-        if np.shape(self.centre) != (2,) or not np.all(np.isfinite(self.centre)):
+        if np.shape(self.centre) != (2,) or not all(is_number(x) and np.isfinite(x) for x in self.centre):
             raise ValueError(f"Disc: centre is {self.centre}; give two finite numbers in metres")
         object.__setattr__(self, "centre", (float(self.centre[0]), float(self.centre[1])))
 
@@ -318,8 +319,8 @@ def cross(a: Vectors, b: Vectors) -> Vectors:
 
 def _require_positive(what: str, **sizes: float) -> None:
     for name, value in sizes.items():
-        if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"{what}: {name} is {value}; give a positive length in metres")
+        if not (is_number(value) and np.isfinite(value) and value > 0):
+            raise ValueError(f"{what}: {name} is {shown(value)}; give a positive length in metres")
 
 
 def _signed_area(points: np.ndarray) -> float:

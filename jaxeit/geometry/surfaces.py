@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..kinds import is_number, shown
+
 
 class SurfaceError(ValueError):
     """A surface that cannot carry the sheet."""
@@ -47,8 +49,8 @@ class AbstractSurface(ABC):
 
 
 def _require_radius(radius: float) -> None:
-    if not (np.isfinite(radius) and radius > 0):
-        raise SurfaceError(f"the surface's radius is {radius} m; give a length above zero")
+    if not (is_number(radius) and np.isfinite(radius) and radius > 0):
+        raise SurfaceError(f"the surface's radius is {shown(radius)} m; give a length above zero")
 
 
 @dataclass(frozen=True)

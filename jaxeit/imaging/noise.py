@@ -345,7 +345,10 @@ def noise_weight(noise: Any, readings: int, channels: np.ndarray) -> Any:
     library, known = (JAX, False) if is_traced(noise) else (NUMPY, True)
     noise = jnp.asarray(noise) if not known else np.asarray(noise, float)
     if noise.shape not in ((readings,), (readings, readings)):
-        raise InverseError(f"noise has shape {noise.shape}; this model has {readings} readings")
+        raise InverseError(
+            f"noise has shape {noise.shape}; this model has {readings} readings: give the standard deviation of each, "
+            f"V, such as np.full({readings}, 1e-6), or their covariance, V^2"
+        )
     if noise.ndim == 2:
         return _known_inverse(noise, channels) if known else _inverse_covariance(library, noise, channels)
     bad = channels & ~(np.isfinite(noise) & (noise > 0)) if known else np.zeros(readings, bool)

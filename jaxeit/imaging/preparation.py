@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from .._compile import full_precision, is_traced, verb
-from ..kinds import require_kind
+from ..kinds import is_number, require_kind
 from ..model.bases import AbstractBasis, BasisMap, Pixels
 from ..model.discretisation import Model, require_model
 from ..model.sensitivity import pair_jacobian
@@ -238,13 +238,9 @@ def require_choices(prior: Any, method: Any, basis: Any, weight: Any) -> None:
             f"the prior {type(prior).__name__} changes with the image, and the method {type(method).__name__} takes it "
             "only once; choose the method Reweighted, or another prior"
         )
-    if not (isinstance(weight, AbstractHyperparameter) or is_traced(weight) or _is_number(weight)):
+    if not (isinstance(weight, AbstractHyperparameter) or is_traced(weight) or is_number(weight)):
         ways = "a number, such as 0.1, or a way to choose one, such as je.imaging.LCurve(dv)"
         raise InverseError(f"the hyperparameter is {weight!r}; give {ways}")
-
-
-def _is_number(value: Any) -> bool:
-    return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
 
 
 def check_range(hyperparameter: Any, method: Any, dtype: np.dtype) -> None:

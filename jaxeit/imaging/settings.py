@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from ..kinds import require_kind
 from ..model.bases import BASES, AbstractBasis, Pixels
 from ..model.discretisation import Model
 from .hyperparameters import HYPERPARAMETERS, AbstractHyperparameter
@@ -45,6 +46,9 @@ class Imaging:
 
     def __post_init__(self) -> None:
         require_choices(self.prior, self.method, self.basis, self.hyperparameter)
+        require_kind(
+            self.noise, AbstractNoise, InverseError, "a noise", "an object, such as je.imaging.MeasuredNoise()"
+        )
         weight = self.hyperparameter
         if isinstance(weight, int | float) and not 0 < weight < float("inf"):
             raise InverseError(f"the hyperparameter is {weight}; give a number above zero, such as 0.1")

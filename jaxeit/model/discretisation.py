@@ -174,10 +174,15 @@ def require_model(model: Any) -> None:
         raise SceneError(f"{kind} is not a model; make one, such as jaxeit.discretise(scene, jaxeit.Fidelity.draft())")
 
 
-def _require_kinds(scene: Any, fidelity: Any) -> None:
-    """Refuse an object in the place of a scene or of a fidelity, such as a skin or a name."""
+def require_scene(scene: Any) -> None:
+    """Refuse an object in the place of a scene, such as a skin or a name; raises `SceneError`."""
     if not isinstance(scene, Scene):
         raise SceneError(f"{type(scene).__name__} is not a scene; make one, such as jaxeit.Scene(skin, effects=())")
+
+
+def _require_kinds(scene: Any, fidelity: Any) -> None:
+    """Refuse an object in the place of a scene or of a fidelity, such as a skin or a name."""
+    require_scene(scene)
     if not isinstance(fidelity, Fidelity):
         raise FidelityError(f"{type(fidelity).__name__} is not a fidelity; make one, such as jaxeit.Fidelity.draft()")
 

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int, Integer
 from .._compile import verb
 from ..budget import require
 from ..effects import AbstractTerminalEffect, chosen
+from ..kinds import require_kind
 from .bases import AbstractBasis, BasisMap, Elements
 from .discretisation import Model, require_model
 from .forward_model import (
@@ -51,12 +52,16 @@ def jacobian(
 
     Raises:
         SceneError: if ``model`` is no model, such as a skin.
-        ValueError: if ``sigma`` does not fit the model, or is that of two sheets.
+        ValueError: if ``sigma`` does not fit the model, is that of two sheets, or is a basis, or ``basis`` is none.
     """
     require_model(model)
     if isinstance(sigma, CoatedSheet):
         raise ValueError("sigma is that of a sheet and its coat; the Jacobian is for one sheet: give sigma.sigma")
+    if isinstance(sigma, AbstractBasis | BasisMap):
+        kind = type(sigma).__name__
+        raise ValueError(f"sigma is a basis, {kind}; give it by name, as in jaxeit.jacobian(model, basis=...)")
     basis = Elements() if basis is None else basis
+    require_kind(basis, (AbstractBasis, BasisMap), ValueError, "a basis", "an object, such as basis=Pixels(40)")
     image = basis if isinstance(basis, BasisMap) else basis.on(model)
     return scaled_jacobian(model, None if sigma is None else jnp.asarray(sigma), image)
 

@@ -9,6 +9,9 @@ import numpy as np
 
 from .._compile import is_traced
 
+NO_NUMBERS = "SUOMmc"
+"""Kinds of arrays of texts, objects, dates and complex numbers."""
+
 
 class SettingError(ValueError):
     """A setting outside its limits; the message names the class, the setting and the limits."""
@@ -34,8 +37,10 @@ class Limits(NamedTuple):
     unit: str = ""
 
     def outside(self, value: Any) -> np.ndarray:
-        """The numbers of a value, an array or a scalar, that have no meaning."""
+        """The numbers of a value, an array or a scalar, that have no meaning; all of what holds no real numbers."""
         numbers = np.atleast_1d(np.asarray(value))
+        if numbers.dtype.kind in NO_NUMBERS:
+            return numbers
         low = numbers > self.least if self.open else numbers >= self.least
         kind = (np.isfinite(numbers) | (not self.finite)) & ((numbers.dtype.kind in "iu") | (not self.whole))
         found: np.ndarray = numbers[~(low & (numbers <= self.most) & kind)]
@@ -111,9 +116,15 @@ def require_limits(thing: Any, error: type[ValueError] = SettingError) -> None:
         if limits is None or value is None or is_traced(value):
             continue
         if (wrong := limits.outside(value)).size:
-            shown = repr(wrong[0].item()) if limits.whole else f"{wrong[0]:g}"  # 16.0 is no whole number
-            shown += limits.unit and f" {limits.unit}"
-            raise error(f"{type(thing).__name__}: {field.name} is {shown}; give {limits}")
+            raise error(f"{type(thing).__name__}: {field.name} is {_shown(wrong, limits)}; give {limits}")
+
+
+def _shown(wrong: np.ndarray, limits: Limits) -> str:
+    """The first of some wrong values, as a message shows it."""
+    if wrong.dtype.kind in NO_NUMBERS:
+        return repr(wrong.tolist()[0])
+    shown = repr(wrong[0].item()) if limits.whole else f"{wrong[0]:g}"  # 16.0 is no whole number
+    return shown + (limits.unit and f" {limits.unit}")
 
 
 class AbstractChoice(eqx.Module):

@@ -14,7 +14,7 @@ import numpy as np
 from ..budget import require
 from ..geometry.shapes import Disc, Domain, Polygon, Rectangle
 from ..geometry.surfaces import AbstractSurface, Cylinder, Sphere
-from ..kinds import require_kind
+from ..kinds import require_kind, stated
 from ..notebook import Drawing, card
 from ..registry import RegistryError
 from ..toml import TomlError, TomlTable, parse_toml, read_text
@@ -39,10 +39,11 @@ class Pad:
     outline: np.ndarray
 
     def __post_init__(self) -> None:
-        require_kind(self.outline, (np.ndarray, Sequence), SkinError, "an outline", _CORNERS, f"pad {self.name!r}")
         try:
             Polygon(self.outline)
-        except (TypeError, ValueError) as error:
+        except TypeError:
+            raise SkinError(f"pad {self.name!r}: {stated(self.outline)} is not an outline; give {_CORNERS}") from None
+        except ValueError as error:
             raise SkinError(f"pad {self.name!r}: {error}") from None
         object.__setattr__(self, "outline", np.asarray(self.outline, float))
 
@@ -184,6 +185,8 @@ def load_skin(name_or_path: str | Path) -> Skin:
     Raises:
         TomlError: naming the file, the key and the reason.
     """
+    give = 'one of them, such as je.load_skin("testbed")'
+    require_kind(name_or_path, (str, os.PathLike), TomlError, "the name of a shipped skin or a path", give, "load_skin")
     if str(name_or_path) in shipped_skins():
         shipped = resources.files(__package__).joinpath("skins", f"{name_or_path}.toml")
         return parse_skin(shipped.read_text(encoding="utf-8"), str(name_or_path))

@@ -19,6 +19,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from ..geometry.shapes import Domain
+from ..kinds import is_number, shown
 from ..meshing.elements import Space
 from ..meshing.footprints import AbstractFootprint
 from ..registry import Registry
@@ -139,14 +140,16 @@ def touched(
 def require_positive(**values: float) -> None:
     """Raise ElectrodeError, with the name of the value, unless every value is a positive number."""
     for name, value in values.items():
-        if not (np.isfinite(value) and value > 0):
-            raise ElectrodeError(f"an electrode's {name} is {value}; give a positive number")
+        if not (is_number(value) and np.isfinite(value) and value > 0):
+            raise ElectrodeError(f"an electrode's {name} is {shown(value)}; give a positive number")
 
 
 def require_contact(value: float, unit: str) -> None:
     """Raise ElectrodeError for a contact resistance that is neither zero nor a positive number."""
-    if not (np.isfinite(value) and value >= 0):
-        raise ElectrodeError(f"an electrode's contact is {value} {unit}; give zero (perfect) or a positive number")
+    if not (is_number(value) and np.isfinite(value) and value >= 0):
+        raise ElectrodeError(
+            f"an electrode's contact is {shown(value)} {unit}; give zero (perfect) or a positive number"
+        )
 
 
 def require_covered(space: Space, elements: np.ndarray, area: float, what: str) -> None:

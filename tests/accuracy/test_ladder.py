@@ -322,3 +322,10 @@ def test_the_benchmark_smokes():
     assert found["rungs"][0]["least_ms"] > 0
     assert "least_ms" not in found["rungs"][1]  # float32
     assert 0 < found["reference"]["difference_uncertainty"] < found["rungs"][0]["difference_error"]
+
+
+def test_a_name_and_a_skin_are_no_scene(skin):
+    with pytest.raises(je.model.SceneError, match=r"str is not a scene; make one, such as jaxeit.Scene\(skin, effects"):
+        je.ladder("testbed")
+    with pytest.raises(je.model.SceneError, match="Skin is not a scene"):
+        je.ladder(skin)

@@ -194,6 +194,10 @@ def test_float32_images_follow_float64(skin, model, pixels, recon):
         ({"hyperparameter": 0.0}, "above zero"),
         ({"hyperparameter": float("nan")}, "above zero"),
         ({"noise": np.ones(3)}, "550 readings"),
+        (
+            {"noise": 1e-6},
+            r"noise has shape \(\); .* 550 readings: give the .* V, such as np.full\(550, 1e-6\)",
+        ),
         ({"noise": np.zeros(550)}, "reading 0"),
         ({"channels": np.zeros(550, bool)}, "every channel"),
         ({"sigma": None, "channels": np.ones(2, bool)}, "550 readings"),

@@ -15,6 +15,7 @@ from jaxeit.meshing.generation import Mesh, MeshError, TrianglePattern, structur
 from jaxeit.meshing.outlines import ArcFootprint, DiscFootprint, PointFootprint, polygon_radius
 from jaxeit.meshing.smoothing import Triangulation
 from jaxeit.meshing.triangles import CROWDED
+from jaxeit.skin.electrodes import require_contact
 
 L_SHAPE = Polygon(((0, 0), (0.2, 0), (0.2, 0.1), (0.1, 0.1), (0.1, 0.2), (0, 0.2)))
 SQUARE = Rectangle(0.2, 0.2)
@@ -143,6 +144,11 @@ def test_clearance_is_the_width_across():
     [
         (lambda: Rectangle(-1, 1), "Rectangle: width is -1; give a positive length"),
         (lambda: Rectangle(1, np.nan), "Rectangle: height is nan"),
+        (lambda: Rectangle("1", 2), "Rectangle: width is '1'; give a positive length in metres"),
+        (lambda: Rectangle(1, None), "Rectangle: height is None; give a positive length in metres"),
+        (lambda: Disc(1.0, ("a", "b")), "Disc: centre is"),
+        (lambda: je.Cylinder("1"), "the surface's radius is '1' m; give a length above zero"),
+        (lambda: require_contact("1", "ohm"), "an electrode's contact is '1'"),
         (lambda: Disc(0.0), "Disc: radius is 0.0"),
         (lambda: Disc(1.0, (0.0, np.inf)), "Disc: centre is"),
         (lambda: Polygon(((0, 0), (1, 0))), "three or more"),

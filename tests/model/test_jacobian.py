@@ -100,6 +100,13 @@ def test_rank_is_that_of_the_electrodes(model):
     assert (values > 1e-10 * values[0]).sum() <= 25 * 24 // 2
 
 
+def test_a_basis_is_given_by_name(small):
+    with pytest.raises(ValueError, match=r"sigma is a basis, Pixels; give it by name, as in jaxeit.jacobian\("):
+        je.jacobian(small, je.Pixels(20))
+    with pytest.raises(ValueError, match=r"'pixels' is not a basis; give an object, such as basis=Pixels\(40\)"):
+        je.jacobian(small, basis="pixels")
+
+
 def test_a_new_conductivity_compiles_nothing(small, compilations):
     je.jacobian(small, small.background)
     je.forward(small, small.background)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import calib
 import jaxeit as je
 from jaxeit.imaging import HYPERPARAMETERS, METHODS, PRIORS
 from jaxeit.model.bases import BASES
-from jaxeit.registry import SettingError, settings_of
+from jaxeit.registry import AbstractChoice, SettingError, limited, settings_of
 from jaxeit.scan import CRITERIA
 
 REGISTRIES = [
@@ -77,6 +78,21 @@ def test_no_number_that_is_not_finite_and_no_fraction_of_a_count():
         je.Noser(50.0)
 
 
+class Firmness(AbstractChoice):
+    """A choice outside of the packages, where annotations are not checked."""
+
+    share: float = limited(0.5, above=0.0, most=1.0, unit="m")
+
+
+@pytest.mark.parametrize("value", ["20", {}, 1j, b"1", je.Noser, ("a", 1.0)])
+def test_what_is_no_number_is_refused(value):
+    said = value[0] if isinstance(value, tuple) else value
+    with pytest.raises(SettingError, match=re.escape(f"Firmness: share is {said!r}; give more than 0 to 1 m")):
+        Firmness(value)
+    with pytest.raises(je.model.BasisError, match="Pixels: columns is '20'; give 1 to 2000, a whole number"):
+        je.Pixels("20")
+
+
 def test_a_word_names_the_setting_once():
     with pytest.raises(ValueError, match=r"^prior 'noser:exponent=50': Noser: exponent is 50; give 0 to 1$"):
         PRIORS.make("noser:exponent=50")
@@ -85,6 +101,11 @@ def test_a_word_names_the_setting_once():
 def test_hidden_values_are_not_looked_at():
     """Under grad no limit can be checked, and none is."""
     assert jax.grad(lambda width: 2 * calib.fitting.Huber(width).width)(-1.0) == 2
+
+
+def test_a_name_is_no_noise():
+    with pytest.raises(je.imaging.InverseError, match=r"'measured' is not a noise; give an object, such as"):
+        je.Imaging(noise="measured")
 
 
 @pytest.mark.parametrize("weight", ["gcv", None, [0.1], True, je.imaging.LCurve])

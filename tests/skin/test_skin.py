@@ -360,3 +360,10 @@ def test_a_skin_is_the_same_whatever_its_text(skin):
 def test_pads_from_python_are_asked_as_those_of_files(skin, outline, said):
     with pytest.raises(je.skin.SkinError, match=f"^{said}"):
         replace(skin, pads=(je.Pad("a", np.array(outline) if isinstance(outline, tuple) else outline),))
+
+
+@pytest.mark.parametrize(("given", "stated"), [(None, "NoneType"), (3, "int"), (je.Rectangle(1, 1), "Rectangle")])
+def test_what_is_no_name_and_no_path_is_no_skin(given, stated):
+    said = rf"load_skin: {stated} is not the name of a shipped skin or a path; give one of them, such as je.load_skin\("
+    with pytest.raises(je.toml.TomlError, match=said):
+        je.load_skin(given)
