@@ -72,8 +72,7 @@ def apply(
     """
     require_session(session, "apply")
     if isinstance(calibration, LogCalibration):
-        choices = {"processing": processing, "loads": loads, "load_settings": load_settings, "track": track}
-        require_no_eit_choices("apply", **choices)
+        require_no_eit_choices("apply", processing=processing, loads=loads, load_settings=load_settings, track=track)
         return _write_log_forces(calibration, session, path, ignore_errors, tell)
     require_calibration(calibration, "apply")
     processing = processing or calibration.processing
