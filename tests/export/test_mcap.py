@@ -189,8 +189,8 @@ def test_directions_and_normals(skin):
         known = surface.project(surface(chart)).normal
         np.testing.assert_allclose(normals_in_space(surface, chart), known, atol=1e-7)
     np.testing.assert_array_equal(normals_in_space(None, chart), np.tile([0.0, 0.0, 1.0], (20, 1)))
-    triangle = replace(skin.pads[0], outline=np.array([[1.0, 1.0], [4.0, 1.0], [1.0, 4.0]]))
-    np.testing.assert_allclose(pad_centres(replace(skin, pads=(triangle,))), [[2.0, 2.0]])
+    triangle = replace(skin.pads[0], outline=np.array([[0.01, 0.01], [0.04, 0.01], [0.01, 0.04]]))
+    np.testing.assert_allclose(pad_centres(replace(skin, pads=(triangle,))), [[0.02, 0.02]])
 
 
 def test_a_session_comes_back_by_import(tmp_path):

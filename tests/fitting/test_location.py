@@ -136,8 +136,9 @@ def test_a_place_beside_a_pad_counts_as_its_nearest_edge(geometry):
 
 def test_pads_with_fewer_corners_and_round_sheets(skin):
     triangle = je.Pad("t", np.array([[0.02, 0.02], [0.08, 0.02], [0.05, 0.08]]))
+    square = je.Pad("s", np.array([[-0.06, -0.06], [-0.01, -0.06], [-0.01, -0.01], [-0.06, -0.01]]))
     round_sheet = je.Disc(0.1)
-    odd = je.Skin("odd", round_sheet, 1.0, skin.electrodes, skin.protocol, (skin.pads[3], triangle))
+    odd = je.Skin("odd", round_sheet, 1.0, skin.electrodes, skin.protocol, (square, triangle))
     point = np.array([[0.05, 0.04]])
     field = PadEdge(0.01, bumps=1)
     features = np.asarray(features_of(field, geometry_of(odd), single_places(point, 2)))[0, 1]

@@ -97,7 +97,8 @@ def test_a_round_sheet_has_averages_too(skin):
     rng = np.random.default_rng(5)
     angle, radius = rng.uniform(0, 2 * np.pi, 200), 0.09 * np.sqrt(rng.uniform(0, 1, 200))
     stage = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
-    disc = je.Skin("round", je.Disc(0.1), 1.0, skin.electrodes, skin.protocol, skin.pads[3:])
+    pad = je.Pad("all", np.array([[-0.07, -0.07], [0.07, -0.07], [0.07, 0.07], [-0.07, 0.07]]))
+    disc = je.Skin("round", je.Disc(0.1), 1.0, skin.electrodes, skin.protocol, (pad,))
     image = stage * (1 - 0.02 * np.exp(-(0.1 - radius) / 0.015))[:, None]
     found = steady_places(geometry_of(disc), single_places(image + ERROR * rng.normal(size=(200, 2)), 1), stage)
     left = np.linalg.norm(np.asarray(found.position)[:, 0] - image, axis=1)

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from ...presses.streams import true_runs
-from ...session.units import SECOND
+from ...session.units import SECOND, UNITS
 from ..report import Finding, Severity
 from ..streams.statistics import StreamStatistics
 from .blocks import MAX_CELLS, LogBlocks
@@ -13,6 +13,8 @@ from .blocks import MAX_CELLS, LogBlocks
 MIN_LENGTH, MIN_SHARE = 100, 0.05  # samples of a copy, and their share of the log
 MIN_DISTINCT = 0.25  # of the samples of a copy: channels at rest repeat few values
 SAME = 2e-7  # of the largest value: rounding of single precision; sensors differ by more
+# One column imported as two streams: what their units make of it. Another ratio may be that of an ideal sensor.
+RATIOS = np.unique([unit.factor / load.factor for unit in UNITS.values() for load in UNITS.values() if load.si == "N"])
 
 
 def log_copy_finding(statistics: Mapping[str, StreamStatistics], signal: str) -> Iterator[Finding]:
@@ -73,7 +75,8 @@ def same_column_finding(log: LogBlocks) -> Iterator[Finding]:
         return
     ratio = log.values[largest] / log.force[largest]
     away = np.abs(log.values - ratio * log.force[:, None]).max(0)
-    same = np.flatnonzero(away <= SAME * np.abs(log.values[largest]))
+    of_unit = np.isclose(ratio[:, None], RATIOS, rtol=SAME, atol=0).any(1)
+    same = np.flatnonzero((away <= SAME * np.abs(log.values[largest])) & of_unit)
     if len(same):
         column = log.column[same[0]]
         what = f"column {column} is the force times {ratio[same[0]]:.6g} in every sample: one column for two streams"
