@@ -86,7 +86,13 @@ def learn_loads(
             number or the force not above zero, or jit hides the values; and as for `prepare_loads`.
 
     Example:
-        learned = je.contacts.learn_loads(model, frames, places, forces, noise=noise, untouched=v0)
+        x, y = jnp.meshgrid(jnp.array([0.05, 0.1, 0.15]), jnp.array([0.06, 0.14]))
+        pressed, forces = jnp.stack([x, y], -1).reshape(-1, 2), jnp.array([5.0, 10, 20, 8, 15, 12])  # m, N
+        squares = jnp.sum((model.centroids - pressed[:, None]) ** 2, -1)
+        pressure = forces[:, None] * jnp.exp(-squares / (2 * 0.012**2)) / (2 * jnp.pi * 0.012**2)  # Pa
+        law = je.effects.ContactPiezoresistance(amplitude=1.5, half_pressure=25e3)
+        frames = jnp.stack([je.forward(model, model.background * f) for f in law.factor(pressure)]) - v0
+        learned = je.contacts.learn_loads(model, frames, pressed, forces, noise=noise, untouched=v0)
         fitter = je.contacts.prepare_loads(model, learned, noise=noise, untouched=v0)
         print(learned.changed())
     """
