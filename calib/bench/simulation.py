@@ -55,8 +55,9 @@ def simulate(
     fidelity = SIMULATION if fidelity is None else fidelity
     path = Path(path)
     made = simulated_streams(bench, fidelity)
-    _require_space(made, path)
-    store = _BlockStore(path.with_name(path.name + ".part"), _fingerprint(bench, fidelity))
+    part = path.with_name(path.name + ".part")
+    _require_space(made, part)
+    store = _BlockStore(part, _fingerprint(bench, fidelity))
     for name, number, recording in progress(_BlockSequence(made)):
         store.make(name, number, recording)
     _write(made, store, path)
@@ -64,11 +65,15 @@ def simulate(
     return path
 
 
-def _require_space(made: SimulatedStreams, path: Path) -> None:
-    """Refuse a session whose blocks the disk cannot hold, before the first one is simulated."""
+def _require_space(made: SimulatedStreams, part: Path) -> None:
+    """Refuse a session whose blocks the disk cannot hold, before the first one is simulated.
+
+    Args:
+        part: the folder of the blocks; those that an earlier run left there take no further space.
+    """
     sizes = {name: 4.0 * recording.samples * len(recording.resting) for name, recording in made}  # single precision
-    folder = next(folder for folder in path.absolute().parents if folder.is_dir())
-    free = shutil.disk_usage(folder).free
+    folder = next(folder for folder in part.absolute().parents if folder.is_dir())
+    free = shutil.disk_usage(folder).free + sum(block.stat().st_size for block in part.glob("*.npz"))
     if sum(sizes.values()) > free:
         largest = max(sizes, key=sizes.__getitem__)
         raise BenchError(

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from calib.bench import (
     render_costs,
     simulate,
     simulate_contacts,
+    simulation,
     streams,
 )
 from calib.bench.interpolation import ParameterBox, enclosing_boxes, interpolants
@@ -291,6 +293,16 @@ def test_a_session_that_the_disk_cannot_hold_is_not_begun(skin, tmp_path):
     with pytest.raises(BenchError, match=r"the session takes .* GB are free; most of it is pressure: lower its rate"):
         simulate(_bench(skin, pad_rate=1e13), tmp_path / "s.h5", fidelity=DRAFT)
     assert not list(tmp_path.iterdir())
+
+
+def test_blocks_of_an_earlier_run_take_no_further_space(skin, tmp_path, monkeypatch):
+    monkeypatch.setattr(simulation.shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
+    made, part = simulated_streams(_bench(skin), DRAFT), tmp_path / "s.h5.part"
+    with pytest.raises(BenchError, match="0 GB are free"):
+        simulation._require_space(made, part)
+    part.mkdir()
+    (part / "eit-000000.npz").write_bytes(bytes(10_000_000))  # more than the whole session
+    simulation._require_space(made, part)
 
 
 @pytest.mark.slow
