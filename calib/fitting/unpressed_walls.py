@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 import jaxeit as je
 
 from .fields import FittedField, Geometry, PadEdge, PadEdgeSpline, Places
-from .fields.geometry import distance, nearest_points, onto_pads
+from .fields.geometry import onto_pads
+from .fields.pad_edge import wall_distances
 
 # Octaves between two distances that are worth a word: the grid above has 0.68 to 0.71, one of 15 x 15, whose intervals
 # hold, 0.60, and scattered presses have 0.1 to 0.2. And the octave from which on walls hardly matter.
@@ -54,5 +55,4 @@ def _wall_distances(geometry: Geometry, places: Places, share: Float[np.ndarray,
 @je.verb
 def _to_sides(geometry: Geometry, position: Float[Array, "n 2"]) -> Float[Array, "n pads"]:
     """Distance of each pad's nearest side to the point of the pad that is nearest to a position, m."""
-    place = onto_pads(geometry, position)
-    return distance(nearest_points(place, geometry.start, geometry.end), place[..., None, :]).min(-1)
+    return wall_distances(geometry, onto_pads(geometry, position))[0].min(-1)

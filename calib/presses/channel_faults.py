@@ -96,11 +96,11 @@ def _silent(values: np.ndarray, reference: np.ndarray | None, idle: np.ndarray) 
     if reference is None:
         return np.zeros(len(idle), bool)
     known = np.isfinite(reference)
-    follows = [idle[i] or abs(_rank_correlation(v[known], reference[known])) for i, v in enumerate(values.T)]
+    follows = [idle[i] or abs(rank_correlation(v[known], reference[known])) for i, v in enumerate(values.T)]
     return np.array(follows) < MIN_RANK_CORRELATION
 
 
-def _rank_correlation(column: np.ndarray, reference: np.ndarray) -> float:
+def rank_correlation(column: np.ndarray, reference: np.ndarray) -> float:
     """Spearman's rank correlation over the finite samples of a channel; 0 if either is constant."""
     good = np.isfinite(column)
     a, b = column[good], reference[good]

@@ -9,7 +9,7 @@ as it is, and its uncertainty grows by what may have drifted.
 import abc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, overload
+from typing import NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -39,6 +39,8 @@ from .image_reference import ImageReference, fit_reference
 from .ordinary_use import distinct, use_contacts
 from .press_noise import PressNoise, press_noise
 from .skins import other_skin
+
+C = TypeVar("C", Calibration, LogCalibration)
 
 MIN_PRESSES = 3  # of a session that can be used; fewer are refused
 BEYOND = 0.3  # of the calibrated range of pressure, by which the pads may read more than was calibrated
@@ -243,33 +245,9 @@ def update_from_use(prior: GainPrior, reference: ImageReference, noise: PressNoi
     return update_gains(prior, residuals, covariance, nuisance)
 
 
-@overload
 def recalibrate(
-    calibration: Calibration,
-    session: Session,
-    evidence: AbstractEvidence | None = None,
-    *,
-    ignore_errors: bool = False,
-) -> Calibration: ...
-
-
-@overload
-def recalibrate(
-    calibration: LogCalibration,
-    session: Session,
-    evidence: AbstractEvidence | None = None,
-    *,
-    ignore_errors: bool = False,
-) -> LogCalibration: ...
-
-
-def recalibrate(
-    calibration: Calibration | LogCalibration,
-    session: Session,
-    evidence: AbstractEvidence | None = None,
-    *,
-    ignore_errors: bool = False,
-) -> Calibration | LogCalibration:
+    calibration: C, session: Session, evidence: AbstractEvidence | None = None, *, ignore_errors: bool = False
+) -> C:
     """The same calibration, moved to what the pads read in a session. `Calibration.recalibration` says by how much.
 
     The calibration of a log is moved by a log of known force, as `calib.calibration.recalibrate_log` does.
@@ -287,6 +265,13 @@ def recalibrate(
     if isinstance(calibration, LogCalibration):
         return recalibrate_log(calibration, session, _drift_of_log(evidence), ignore_errors=ignore_errors)
     require_calibration(calibration, "recalibrate")
+    return _moved(calibration, session, evidence, ignore_errors)
+
+
+def _moved(
+    calibration: Calibration, session: Session, evidence: AbstractEvidence | None, ignore_errors: bool
+) -> Calibration:
+    """`recalibrate` for the calibration of a skin."""
     require_not_moved_by(calibration.provenance, session)
     found = assess(calibration, session, evidence, ignore_errors=ignore_errors)
     if not found.determined.any() and not ignore_errors:

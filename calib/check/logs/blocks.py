@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import stats
 
+from ...presses.channel_faults import rank_correlation
 from ...presses.streams import resample
 from ...session import Stream
 from ...session.units import SECOND
@@ -107,10 +107,3 @@ def spread(values: np.ndarray) -> float:
 def usual(spreads: np.ndarray) -> float:
     """Spread of a block in which something happens: the second largest (blocks,), as the largest may be a fault."""
     return float(np.sort(spreads)[-2])
-
-
-def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Spearman's rank correlation; 0 if either is constant."""
-    if np.ptp(a) == 0 or np.ptp(b) == 0:
-        return 0.0
-    return float(np.corrcoef(stats.rankdata(a), stats.rankdata(b))[0, 1])

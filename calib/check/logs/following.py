@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 from scipy import signal
 
-from ...presses.channel_faults import MIN_ARRAY_CHANNELS
+from ...presses.channel_faults import MIN_ARRAY_CHANNELS, rank_correlation
 from ...presses.streams import true_runs
 from ..report import Finding, Severity
-from .blocks import SPREAD, LogBlocks, rank_correlation, usual
+from .blocks import SPREAD, LogBlocks, usual
 
 NO_RELATION = 0.2  # correlation, in the whole log and in its blocks, below which a channel tells nothing of the force
 LAGGED = 0.3  # the same where the channel may come early or late by up to a quarter of the log
