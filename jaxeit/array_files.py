@@ -4,7 +4,7 @@ import io
 import math
 import os
 import struct
-import tempfile
+import uuid
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -29,15 +29,16 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray],
     path = Path(path)
     if path.is_file() and path.stat().st_size and not zipfile.is_zipfile(path):
         raise error(f"{path.name}: holds something else than arrays, which would be lost; give another name")
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.part")
+    file = temporary.open("xb")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with file:
             np.savez(file, allow_pickle=False, **dict(arrays))
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
-        os.unlink(temporary)
+        temporary.unlink()
         raise
 
 

@@ -1,6 +1,7 @@
 """Handle signals that end a command, so that temporary files are removed and a recording is finished."""
 
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +12,8 @@ if TYPE_CHECKING:
     from ..record.recorder import StopRequest
 
 
+# After which an interruption that was dropped is raised again; s.
+AGAIN_AFTER = 0.05
 ENDING_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
@@ -28,8 +31,35 @@ def interruption_status(interrupt: KeyboardInterrupt) -> int:
 
 
 @contextmanager
+def _raised_again() -> Iterator[None]:
+    """Within this context an interruption that Python drops is raised again, a moment later.
+
+    An exception that a signal raises inside a callback of the garbage collector, as JAX has one, is only printed.
+    """
+    usual = sys.unraisablehook
+
+    def hook(dropped: "sys.UnraisableHookArgs") -> None:
+        if not isinstance(dropped.exc_value, KeyboardInterrupt):
+            usual(dropped)
+            return
+        to = threading.main_thread().ident, interruption_status(dropped.exc_value) - 128
+        again = threading.Timer(AGAIN_AFTER, signal.pthread_kill, to)
+        again.daemon = True
+        again.start()
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = usual
+
+
+@contextmanager
 def termination_raised() -> Iterator[None]:
-    """Within this context SIGTERM and SIGHUP raise `Terminated`, unless ignored; in the main thread only."""
+    """Within this context SIGTERM and SIGHUP raise `Terminated`, unless ignored; in the main thread only.
+
+    They and Ctrl-C end a command whatever it is doing.
+    """
 
     def terminate(number: int, _frame: FrameType | None) -> None:
         raise Terminated(number)
@@ -40,7 +70,8 @@ def termination_raised() -> Iterator[None]:
     numbers = [number for number in ENDING_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]  # ignored by nohup
     before = {number: signal.signal(number, terminate) for number in numbers}
     try:
-        yield
+        with _raised_again():
+            yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -1,5 +1,7 @@
 """Training of the network: what it is told for its outputs, and epochs that go on after an interruption."""
 
+import hashlib
+import io
 from collections.abc import Callable
 from itertools import permutations
 from pathlib import Path
@@ -15,6 +17,7 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 from jaxeit.contacts import LoadKind
 from jaxeit.contacts.loads.proposal import KINDS, LAYERS, PARAMETERS, SHAPES, loads_by_kind
 
+from ..bench import BenchError
 from ..session import replacing
 
 WIDTH = 320  # of the hidden layers
@@ -71,6 +74,9 @@ def train(
     Args:
         tolerance: errors of the outputs that count as one.
         tell: called after each epoch with its number.
+
+    Raises:
+        BenchError: the checkpoint is damaged, or the weights are no numbers after an epoch.
     """
     key = jax.random.key(seed)
     steps = len(examples.kind) // BATCH
@@ -78,17 +84,35 @@ def train(
     network = new_network(examples.whole.shape[1] + 2 * examples.pads.shape[1], key)
     state = State(network, optimiser.init(eqx.filter(network, eqx.is_array)), jnp.asarray(0))
     if checkpoint.is_file():
-        with checkpoint.open("rb") as file:
-            state = eqx.tree_deserialise_leaves(file, state)
+        state = _read(checkpoint, state)
     run = eqx.filter_jit(epoch)
     while int(state.epochs) < epochs:
         number = int(state.epochs)
         with jax.numpy_dtype_promotion("standard"):  # optax multiplies numbers of several types
             state, _ = run(state, optimiser, examples, jnp.asarray(tolerance), jax.random.fold_in(key, number))
-        with replacing(checkpoint) as new, new.open("wb") as file:
-            eqx.tree_serialise_leaves(file, state)
+        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(eqx.filter(state.network, eqx.is_array))):
+            raise BenchError(f"the weights are no numbers after epoch {number + 1}; give another seed or more frames")
+        _write(checkpoint, state)
         tell(number + 1)
     return state.network
+
+
+def _write(checkpoint: Path, state: State) -> None:
+    """Write a state, with the digest that tells whether it is whole."""
+    buffer = io.BytesIO()
+    eqx.tree_serialise_leaves(buffer, state)
+    with replacing(checkpoint) as new:
+        new.write_bytes(hashlib.sha256(buffer.getvalue()).digest() + buffer.getvalue())
+
+
+def _read(checkpoint: Path, like: State) -> State:
+    """Read what `_write` wrote of a state of these shapes."""
+    whole = checkpoint.read_bytes()
+    size = hashlib.sha256().digest_size
+    if whole[:size] != hashlib.sha256(whole[size:]).digest():
+        raise BenchError(f"{checkpoint} is damaged; remove it, and training begins anew on the scenes beside it")
+    state: State = eqx.tree_deserialise_leaves(io.BytesIO(whole[size:]), like)
+    return state
 
 
 def epoch(

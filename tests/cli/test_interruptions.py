@@ -1,8 +1,10 @@
 """Every command that writes, ended or failing while it writes: one line, no half-written file, what was there stays."""
 
 import errno
+import gc
 import os
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -119,3 +121,24 @@ def spoilt(cause, folder):
             cause()
 
     return sync
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interruption_within_a_collection_of_garbage_ends_the_command(number, status, monkeypatch):
+    """Python drops what a callback of the collector raises."""
+
+    def interrupted(phase, info):
+        gc.callbacks.remove(interrupted)
+        os.kill(os.getpid(), number)
+        time.sleep(0.01)  # the signal is handled here
+
+    def run(args):
+        gc.callbacks.append(interrupted)
+        gc.collect()
+        time.sleep(5)
+        return 0
+
+    monkeypatch.setattr("calib.cli.commands.doctor_command.run", run)
+    began = time.monotonic()
+    assert main(["doctor"]) == status
+    assert time.monotonic() - began < 4

@@ -147,6 +147,26 @@ def test_an_interruption_changes_nothing(tmp_path):
     assert (np.asarray(out)[:, :2].argmax(1) == np.asarray(data.kind)).mean() > 0.9
 
 
+DAMAGE = (lambda whole: b"", lambda whole: whole[:-9], lambda whole: whole[:-4] + b"\xff" * 4)
+
+
+@pytest.mark.parametrize("damaged", DAMAGE)
+def test_a_damaged_checkpoint_is_refused(tmp_path, damaged):
+    data, unit, path = examples(np.random.default_rng(0), 256), np.full(PARAMETERS, 0.1, "float32"), tmp_path / "c"
+    training.train(data, unit, 1, 1, path, lambda done: None)
+    path.write_bytes(damaged(path.read_bytes()))
+    with pytest.raises(BenchError, match="is damaged; remove it"):
+        training.train(data, unit, 2, 1, path, lambda done: None)
+
+
+def test_weights_that_are_no_numbers_are_not_kept(tmp_path):
+    data, path = examples(np.random.default_rng(0), 256), tmp_path / "c"
+    unit = np.full(PARAMETERS, np.nan, "float32")
+    with pytest.raises(BenchError, match="no numbers after epoch 1"):
+        training.train(data, unit, 2, 1, path, lambda done: None)
+    assert not path.exists()
+
+
 @pytest.fixture
 def small(monkeypatch):
     """A skin of six electrodes, few frames, and one thread in place of processes."""
