@@ -99,10 +99,15 @@ class _BlockSequence:
 
 def _fingerprint(bench: Bench, fidelity: je.Fidelity) -> str:
     """Hash of everything that a block depends on."""
+    return hashlib.sha256(f"{_identity(bench)}{fidelity}{metadata.version('jaxeit')}".encode()).hexdigest()
+
+
+def _identity(bench: Bench) -> str:
+    """Hash of a bench, whether a file or Python made it."""
     plan = [getattr(bench, name) for name in bench.__dataclass_fields__ if name != "scene"]
-    said = repr((plan, bench.scene.skin.toml, jax.tree.leaves(bench.scene.effects), bench.scene.effects, fidelity))
+    said = repr((plan, bench.scene.skin.toml, jax.tree.leaves(bench.scene.effects), bench.scene.effects))
     arrays = b"".join(np.ascontiguousarray(a).tobytes() for a in (bench.sites, bench.forces))
-    return hashlib.sha256(said.encode() + arrays + metadata.version("jaxeit").encode()).hexdigest()
+    return hashlib.sha256(said.encode() + arrays).hexdigest()
 
 
 class _BlockStore:
@@ -123,6 +128,11 @@ class _BlockStore:
         if self._file(name, number).exists():
             return
         samples, state = recording.block(number, self._state(name, number, recording))
+        if not np.isfinite(samples.values).all():
+            raise BenchError(
+                f"block {number} of {name} has samples that are no finite numbers; an effect of the scene "
+                "makes them: leave effects out, one by one, to find it"
+            )
         leaves = {f"state{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state))}
         arrays = samples._asdict() | {"values": samples.values.astype(np.float32)} | leaves
         _replace(self._file(name, number), lambda file: np.savez(file, **arrays))
@@ -185,7 +195,7 @@ def simulated_facts(bench: Bench, title: str, session_id: str | None = None) -> 
 
 def _write(made: SimulatedStreams, store: _BlockStore, path: Path) -> None:
     bench = made.bench
-    session_id = str(uuid5(NAMESPACE_OID, f"{bench.toml}{bench.seed}"))
+    session_id = str(uuid5(NAMESPACE_OID, _identity(bench)))
     writer = SessionWriter(path, simulated_facts(bench, bench.title, session_id))
     about = {
         "eit": ("voltage", "V", bench.eit_step or 2 * float(np.abs(made.eit.resting).max()) / np.iinfo("i2").max),

@@ -21,14 +21,16 @@ Histories are processed in blocks of samples; a history effect passes its state 
 import enum
 import zlib
 from abc import abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from .._compile import is_traced
 from ..registry import limited, require_limits
 
 
@@ -143,23 +145,42 @@ State: TypeAlias = PyTree[Array]
 
 LONGEST = 1.0
 """Largest length of an effect, m: longer than any skin, and below what a length in mm would be."""
+MOST_STD = 3.0
+"""Largest standard deviation of a logarithm: 95 % of what is drawn lie within a factor of 400."""
 
 
-def parameter(default: float | tuple[float, ...], *, least: float = 0.0) -> Any:
+def parameter(default: float | tuple[float, ...], *, least: float = 0.0, finite: bool = True, **limits: Any) -> Any:
     """A numeric field that is a pytree leaf, so that a new value does not trigger recompilation.
 
-    An effect with a value below ``least`` is refused when it is made, unless jit, grad or vmap hides the value.
+    An effect with a value outside of its ``limits`` (`jaxeit.registry.limited`) is refused when it is made, unless jit,
+    grad or vmap hides the value. They are where the law itself ends, far beyond the values of real skins.
     """
-    return limited(default, least=least, finite=False, converter=jnp.asarray)
+    return limited(default, least=least, finite=finite, converter=jnp.asarray, **limits)
 
 
-def metres(default: float) -> Any:
+def metres(default: float, **limits: Any) -> Any:
     """A `parameter` that is a length, m, of which one above `LONGEST` is refused as well."""
-    return limited(default, least=0.0, most=LONGEST, unit="m", converter=jnp.asarray)
+    return limited(default, **{"least": 0.0} | limits, most=LONGEST, unit="m", converter=jnp.asarray)
 
 
 class EffectError(ValueError):
     """An effect whose parameters have no meaning; the message names the parameter."""
+
+
+def require_relation(effect: "AbstractEffect", names: Sequence[str], holds: Callable[..., bool], wanted: str) -> None:
+    """Refuse an effect whose parameters do not fit one another, unless jit, grad or vmap hides one of them.
+
+    Args:
+        holds: whether the values of the parameters, as NumPy's arrays, fit.
+        wanted: what to give instead, for the message.
+    """
+    require_limits(effect, EffectError)  # of the classes above comes later
+    values = [getattr(effect, name) for name in names]
+    if not any(map(is_traced, values)) and not holds(*map(np.asarray, values)):
+        given = " and ".join(
+            f"{name} is {np.asarray(value).tolist()}" for name, value in zip(names, values, strict=True)
+        )
+        raise EffectError(f"{type(effect).__name__}: {given}; give {wanted}")
 
 
 class AbstractEffect(eqx.Module):
@@ -170,7 +191,8 @@ class AbstractEffect(eqx.Module):
     A scene file must give the parameters ``to_be_set``, whose defaults of 1 are no usual value.
 
     Raises:
-        EffectError: for a parameter below its least value, such as a negative standard deviation.
+        EffectError: for a parameter outside of its limits, such as a negative standard deviation, and for parameters
+            that do not fit one another.
     """
 
     stage: ClassVar[str]

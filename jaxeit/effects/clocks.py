@@ -23,7 +23,7 @@ class ClockError(AbstractClockEffect):
     | batch: period of the adapter, 0 for none | 0       | 1e-3 to 16e-3    | s    | assumption: USB serial     |
     """
 
-    skew: Float[Array, ""] = parameter(50e-6, least=-jnp.inf)
+    skew: Float[Array, ""] = parameter(50e-6, above=-1.0)
     offset: Float[Array, ""] = parameter(0.0, least=-jnp.inf)
     latency: Float[Array, ""] = parameter(1e-3)
     jitter: Float[Array, ""] = parameter(5e-4)
@@ -46,7 +46,7 @@ class DropOut(AbstractClockEffect):
     | probability   | 1e-3    | 0 to 0.05 | 1    | assumption |
     """
 
-    probability: Float[Array, ""] = parameter(1e-3)
+    probability: Float[Array, ""] = parameter(1e-3, most=1.0)
     stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
     def __call__(self, packets: Packets, key: Key[Array, ""]) -> Packets:

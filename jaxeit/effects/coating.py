@@ -36,11 +36,11 @@ class ContinuousCoating(AbstractCoatEffect):
 
     alternative: ClassVar[str] = "how pressure makes the sheet conduct"
 
-    resistance: Float[Array, ""] = parameter(0.1)
-    contact_resistivity: Float[Array, ""] = parameter(1.6e-5)
-    reference_pressure: Float[Array, ""] = parameter(64e3)
+    resistance: Float[Array, ""] = parameter(0.1, above=0.0)
+    contact_resistivity: Float[Array, ""] = parameter(1.6e-5, above=0.0)
+    reference_pressure: Float[Array, ""] = parameter(64e3, above=0.0)
     exponent: Float[Array, ""] = parameter(1.0)
-    coverage: Float[Array, ""] = parameter(1 / 3)
+    coverage: Float[Array, ""] = parameter(1 / 3, most=1.0)
 
     def __call__(self, sheet: Sheet) -> Sheet:
         coupling = (

@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .base import AbstractContactEffect, AbstractTerminalEffect, Circuit, parameter
+from .base import MOST_STD, AbstractContactEffect, AbstractTerminalEffect, Circuit, parameter
 from .random import own_normal
 
 
@@ -20,7 +20,7 @@ class ContactScatter(AbstractContactEffect):
     | seed of the electrodes     | 0       |        |      |            |
     """
 
-    std: Float[Array, ""] = parameter(0.5)
+    std: Float[Array, ""] = parameter(0.5, most=MOST_STD)
     seed: Int[Array, ""] = parameter(0)
 
     def __call__(self, contact: Float[Array, " electrodes"]) -> Float[Array, " electrodes"]:
@@ -47,9 +47,9 @@ class ElectrodeFault(AbstractTerminalEffect):
     """
 
     electrode: Int[Array, " lost"] | Int[Array, ""] = parameter(0)
-    resistance: Float[Array, " lost"] | Float[Array, ""] = parameter(1e6)
-    compliance: Float[Array, ""] = parameter(5.0)
-    input_resistance: Float[Array, ""] = parameter(1e7)
+    resistance: Float[Array, " lost"] | Float[Array, ""] = parameter(1e6, finite=False)
+    compliance: Float[Array, ""] = parameter(5.0, above=0.0, finite=False)
+    input_resistance: Float[Array, ""] = parameter(1e7, above=0.0, finite=False)
 
     def __call__(self, voltage: Float[Array, " readings"], circuit: Circuit) -> Float[Array, " readings"]:
         lost = self.electrode

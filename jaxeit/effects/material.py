@@ -5,11 +5,23 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.special import i0e, i1e
 from jaxtyping import Array, Float, Int
 
 from ..registry import computed
-from .base import AbstractMemoryEffect, AbstractSheetEffect, Line, Series, Sheet, State, metres, parameter
+from .base import (
+    MOST_STD,
+    AbstractMemoryEffect,
+    AbstractSheetEffect,
+    Line,
+    Series,
+    Sheet,
+    State,
+    metres,
+    parameter,
+    require_relation,
+)
 from .random import own_field
 
 PLAY_OPERATORS = 8
@@ -29,8 +41,8 @@ class CoatingNonUniformity(AbstractSheetEffect):
     | seed of the sheet             | 0       |          |      |            |
     """
 
-    std: Float[Array, ""] = parameter(0.15)
-    length: Float[Array, ""] = metres(30e-3)
+    std: Float[Array, ""] = parameter(0.15, most=MOST_STD)
+    length: Float[Array, ""] = metres(30e-3, above=0.0)
     seed: Int[Array, ""] = parameter(0)
     field: Float[Array, " elements"] | None = computed()  # by `laid`
 
@@ -57,8 +69,8 @@ class ContactGain(AbstractSheetEffect):
 
     rank: ClassVar[int] = -1  # before the law that turns pressure into conductivity
 
-    std: Float[Array, ""] = parameter(0.12)
-    length: Float[Array, ""] = metres(15e-3)
+    std: Float[Array, ""] = parameter(0.12, most=MOST_STD)
+    length: Float[Array, ""] = metres(15e-3, above=0.0)
     seed: Int[Array, ""] = parameter(0)
     field: Float[Array, " elements"] | None = computed()  # by `laid`
 
@@ -88,7 +100,7 @@ class ContactPiezoresistance(AbstractSheetEffect):
     alternative: ClassVar[str] = "how pressure makes the sheet conduct"
 
     amplitude: Float[Array, ""] = parameter(1.0)
-    half_pressure: Float[Array, ""] = parameter(20e3)
+    half_pressure: Float[Array, ""] = parameter(20e3, above=0.0)
     exponent: Float[Array, ""] = parameter(1.0)
 
     def __call__(self, sheet: Sheet) -> Sheet:
@@ -124,10 +136,10 @@ class HomogenisedIslands(AbstractSheetEffect):
     alternative: ClassVar[str] = "how pressure makes the sheet conduct"
     rank: ClassVar[int] = 1  # after the effects on the sheet's own resistance
 
-    fraction: Float[Array, ""] = parameter(1 / 3)
+    fraction: Float[Array, ""] = parameter(1 / 3, most=float(np.pi / 4))  # round islands touch
     radius: Float[Array, ""] = metres(2e-3)
-    contact: Float[Array, ""] = parameter(1.6e-5)
-    reference: Float[Array, ""] = parameter(64e3)
+    contact: Float[Array, ""] = parameter(1.6e-5, above=0.0)
+    reference: Float[Array, ""] = parameter(64e3, above=0.0)
     exponent: Float[Array, ""] = parameter(1.0)
 
     def __call__(self, sheet: Sheet) -> Sheet:
@@ -155,8 +167,11 @@ class ProtrusionGrid(AbstractSheetEffect):
 
     rank: ClassVar[int] = -1  # before the law that turns pressure into conductivity
 
-    pitch: Float[Array, ""] = metres(6e-3)
-    side: Float[Array, ""] = metres(3.5e-3)
+    pitch: Float[Array, ""] = metres(6e-3, above=0.0)
+    side: Float[Array, ""] = metres(3.5e-3, above=0.0)
+
+    def __check_init__(self) -> None:
+        require_relation(self, ("side", "pitch"), lambda side, pitch: bool(side <= pitch), "a side within the pitch")
 
     def __call__(self, sheet: Sheet) -> Sheet:
         half = sheet.size[:, None] / 2
@@ -179,7 +194,7 @@ class SheetTemperature(AbstractSheetEffect):
     | coefficient c of the sheet's resistance | 1e-3    | -5e-4 to 2e-3 | 1/K | assumption |
     """
 
-    coefficient: Float[Array, ""] = parameter(1e-3, least=-jnp.inf)
+    coefficient: Float[Array, ""] = parameter(1e-3, least=-0.02, most=0.02)  # 50 K change no sign
 
     def __call__(self, sheet: Sheet) -> Sheet:
         return sheet._replace(sigma=sheet.sigma / (1 + self.coefficient * sheet.temperature))
@@ -199,7 +214,7 @@ class Creep(AbstractMemoryEffect):
     """
 
     rate: Float[Array, ""] = parameter(0.05)
-    onset: Float[Array, ""] = parameter(0.1)
+    onset: Float[Array, ""] = parameter(0.1, above=0.0)
 
     def start(self, first: Float[Array, " channels"]) -> State:
         return first, jnp.zeros_like(first)
@@ -235,7 +250,7 @@ class Hysteresis(AbstractMemoryEffect):
     """
 
     loop: Float[Array, ""] = parameter(0.1)
-    reach: Float[Array, ""] = parameter(4.0)
+    reach: Float[Array, ""] = parameter(4.0, above=1.0)
 
     def start(self, first: Float[Array, " channels"]) -> State:
         return _logarithm(first), jnp.zeros((PLAY_OPERATORS, *first.shape), first.dtype)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from .base import AbstractLoadEffect, AbstractStageEffect, Indenter, Path, metres, parameter
+from .base import MOST_STD, AbstractLoadEffect, AbstractStageEffect, Indenter, Path, metres, parameter
 from .random import normal
 
 RIM_COSINES = np.cos(np.pi * (np.arange(32) + 0.5) / 32)
@@ -28,7 +28,7 @@ class StageError(AbstractStageEffect):
 
     position: Float[Array, ""] = metres(0.02e-3)
     jitter: Float[Array, ""] = parameter(5e-3)
-    ripple: Float[Array, ""] = parameter(0.02)
+    ripple: Float[Array, ""] = parameter(0.02, most=MOST_STD)
 
     def __call__(self, path: Path, key: Key[Array, ""]) -> Path:
         place, start, speed = jax.random.split(key, 3)
@@ -53,7 +53,7 @@ class LoadSpreading(AbstractLoadEffect):
 
     alternative: ClassVar[str] = "how a load spreads"
 
-    width: Float[Array, ""] = metres(12e-3)
+    width: Float[Array, ""] = metres(12e-3, above=0.0)
 
     def __call__(
         self, spread: Float[Array, " elements"], touch: Indenter, centroids: Float[Array, "elements 2"]

@@ -9,9 +9,10 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, DTypeLike, Float, Int
 
-from .base import AbstractPadEffect, AbstractPneumaticEffect, Line, Series, State, metres, parameter
+from .base import AbstractPadEffect, AbstractPneumaticEffect, Line, Series, State, metres, parameter, require_relation
 from .random import own_normal
 
 
@@ -24,8 +25,8 @@ class PadEdgeDip(AbstractPadEffect):
     | width w of the stiff border | 10      | 2 to 30  | mm   | chosen: gives the paper's 0.14 |
     """
 
-    depth: Float[Array, ""] = parameter(0.4)
-    width: Float[Array, ""] = metres(10e-3)
+    depth: Float[Array, ""] = parameter(0.4, most=1.0)
+    width: Float[Array, ""] = metres(10e-3, above=0.0)
 
     def __call__(
         self, response: Float[Array, "pads elements"], distance: Float[Array, "pads elements"]
@@ -45,7 +46,7 @@ class PadCrosstalk(AbstractPneumaticEffect):
 
     rank: ClassVar[int] = -4  # acts on the load, before everything in the pad
 
-    fraction: Float[Array, ""] = parameter(0.02)
+    fraction: Float[Array, ""] = parameter(0.02, most=1.0)
 
     def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         others = (series.sum(1, keepdims=True) - series) / max(series.shape[1] - 1, 1)
@@ -70,8 +71,11 @@ class TpuRelaxation(AbstractPneumaticEffect):
     rank: ClassVar[int] = -3
 
     shares: Float[Array, " elements"] = parameter((0.10, 0.08, 0.07))
-    times: Float[Array, " elements"] = parameter((0.1, 1.0, 10.0))
-    gas_share: Float[Array, ""] = parameter(0.5)
+    times: Float[Array, " elements"] = parameter((0.1, 1.0, 10.0), finite=False)
+    gas_share: Float[Array, ""] = parameter(0.5, most=1.0)
+
+    def __check_init__(self) -> None:
+        require_relation(self, ("shares", "times"), _is_series, "as many shares as times, with a sum below 1")
 
     def start(self, first: Float[Array, " channels"]) -> State:
         return first, jnp.zeros((self.times.size, first.size), first.dtype)
@@ -108,9 +112,9 @@ class GasLaw(AbstractPneumaticEffect):
 
     rank: ClassVar[int] = -2
 
-    volume: Float[Array, ""] = parameter(70e-6)
-    compliance: Float[Array, ""] = parameter(7e-10)
-    pressure: Float[Array, ""] = parameter(101325.0)
+    volume: Float[Array, ""] = parameter(70e-6, above=0.0)
+    compliance: Float[Array, ""] = parameter(7e-10, finite=False)
+    pressure: Float[Array, ""] = parameter(101325.0, above=0.0)
 
     def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         structure = 1 / (1 + self.compliance * self.pressure / self.volume)
@@ -135,9 +139,9 @@ class GasRelaxation(AbstractPneumaticEffect):
 
     rank: ClassVar[int] = -1
 
-    time: Float[Array, ""] = parameter(0.31)
-    heat_ratio: Float[Array, ""] = parameter(1.4)
-    gas_share: Float[Array, ""] = parameter(0.5)
+    time: Float[Array, ""] = parameter(0.31, finite=False)
+    heat_ratio: Float[Array, ""] = parameter(1.4, least=1.0)
+    gas_share: Float[Array, ""] = parameter(0.5, most=1.0)
 
     def start(self, first: Float[Array, " channels"]) -> State:
         return first, jnp.zeros_like(first)
@@ -179,7 +183,7 @@ class PadLeak(AbstractPneumaticEffect):
 
     rank: ClassVar[int] = 1
 
-    time: Float[Array, ""] = parameter(300.0)
+    time: Float[Array, ""] = parameter(300.0, finite=False)
 
     def start(self, first: Float[Array, " channels"]) -> State:
         return first, first
@@ -207,6 +211,11 @@ class SensorError(AbstractPneumaticEffect):
     def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         a, b = own_normal(self, self.seed, (2, series.shape[1]), series.dtype)
         return self.offset * a + (1 + self.span * b) * series, state
+
+
+def _is_series(shares: np.ndarray, times: np.ndarray) -> bool:
+    """Whether there is a structure with these Maxwell elements that carries a lasting load."""
+    return shares.ndim == 1 and shares.shape == times.shape and bool(shares.sum() < 1)
 
 
 def _relaxation(

@@ -8,7 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .base import AbstractReadoutEffect, AbstractScanEffect, Line, Series, State, StreamKind, parameter
+from .base import (
+    AbstractReadoutEffect,
+    AbstractScanEffect,
+    Line,
+    Series,
+    State,
+    StreamKind,
+    parameter,
+    require_relation,
+)
 from .random import normal, own_normal
 
 POLE_RATIO = 4.0
@@ -55,7 +64,7 @@ class IntermittentElectrode(AbstractReadoutEffect):
 
     electrode: Int[Array, ""] = parameter(0)
     rate: Float[Array, ""] = parameter(0.1)
-    duration: Float[Array, ""] = parameter(0.2)
+    duration: Float[Array, ""] = parameter(0.2, above=0.0)
     floating: Float[Array, ""] = parameter(0.01)
 
     def start(self, first: Float[Array, " channels"]) -> State:
@@ -167,7 +176,7 @@ class LoadCellError(AbstractReadoutEffect):
     stream: ClassVar[StreamKind] = StreamKind.FORCE  # type: ignore[misc]
 
     nonlinearity: Float[Array, ""] = parameter(1e-3, least=-jnp.inf)
-    full_scale: Float[Array, ""] = parameter(50.0)
+    full_scale: Float[Array, ""] = parameter(50.0, above=0.0)
 
     def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         return series * (1 + 4 * self.nonlinearity * (1 - jnp.abs(series) / self.full_scale)), state
@@ -249,10 +258,13 @@ class Quantisation(AbstractReadoutEffect):
     rank: ClassVar[int] = 1  # after all effects that add to the signal
     to_be_set: ClassVar[tuple[str, ...]] = ("step",)
 
-    step: Float[Array, ""] = parameter(1.0)
-    lowest: Float[Array, ""] = parameter(-jnp.inf, least=-jnp.inf)
-    highest: Float[Array, ""] = parameter(jnp.inf, least=-jnp.inf)
+    step: Float[Array, ""] = parameter(1.0, above=0.0)
+    lowest: Float[Array, ""] = parameter(-jnp.inf, least=-jnp.inf, finite=False)
+    highest: Float[Array, ""] = parameter(jnp.inf, least=-jnp.inf, finite=False)
     stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
+
+    def __check_init__(self) -> None:
+        require_relation(self, ("lowest", "highest"), lambda low, high: bool(low < high), "a range whose ends differ")
 
     def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
         return jnp.clip(jnp.round(series / self.step) * self.step, self.lowest, self.highest), state
@@ -274,10 +286,10 @@ class AdcRanges(AbstractReadoutEffect):
 
     rank: ClassVar[int] = 1
 
-    bits: Int[Array, ""] = parameter(14)
-    full_scale: Float[Array, ""] = parameter(2.5)
-    gains: Float[Array, " gains"] = parameter(tuple(2.0**k for k in range(8)))
-    headroom: Float[Array, ""] = parameter(2.0)
+    bits: Int[Array, ""] = parameter(14, least=1, most=52)
+    full_scale: Float[Array, ""] = parameter(2.5, above=0.0)
+    gains: Float[Array, " gains"] = parameter(tuple(2.0**k for k in range(8)), above=0.0)
+    headroom: Float[Array, ""] = parameter(2.0, above=0.0)
     stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
     def start(self, first: Float[Array, " channels"]) -> State:

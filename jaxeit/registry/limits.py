@@ -115,6 +115,8 @@ def require_limits(thing: Any, error: type[ValueError] = SettingError) -> None:
         limits, value = field.metadata.get("limits"), getattr(thing, field.name)
         if limits is None or value is None or is_traced(value):
             continue
+        if not np.size(value):
+            raise error(f"{type(thing).__name__}: {field.name} is empty; give {limits}")
         if (wrong := limits.outside(value)).size:
             raise error(f"{type(thing).__name__}: {field.name} is {_shown(wrong, limits)}; give {limits}")
 

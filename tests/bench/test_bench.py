@@ -6,7 +6,9 @@ import subprocess
 import sys
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import ClassVar
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -279,6 +281,31 @@ def test_the_remains_of_another_scene_are_not_used(skin, tmp_path):
         simulate(first, tmp_path / "s.h5", fidelity=DRAFT, progress=_stop_after(2))
     path = simulate(second, tmp_path / "s.h5", fidelity=DRAFT)
     assert path.read_bytes() == simulate(second, tmp_path / "t.h5", fidelity=DRAFT).read_bytes()
+
+
+def test_benches_of_one_file_that_differ_make_recordings_that_differ(skin, tmp_path):
+    ids = []
+    for x in (0.06, 0.1):
+        with calib.open_session(
+            simulate(_bench(skin, sites=((x, 0.07),)), tmp_path / f"{x}.h5", fidelity=DRAFT)
+        ) as one:
+            ids.append(one.session_id)
+    assert ids[0] != ids[1]
+
+
+class Breaks(je.effects.AbstractReadoutEffect):
+    """A user's effect that divides by a pressure that is zero at rest."""
+
+    stream: ClassVar[je.effects.StreamKind] = je.effects.StreamKind.PRESSURE
+
+    def __call__(self, series, state, line):
+        return series / jnp.abs(series), state
+
+
+def test_an_effect_that_makes_no_numbers_ends_the_simulation(skin, tmp_path):
+    with pytest.raises(BenchError, match="block 0 of pressure has samples that are no finite numbers; an effect"):
+        simulate(_bench(skin, Breaks(), sites=((0.06, 0.07),)), tmp_path / "s.h5", fidelity=DRAFT)
+    assert not (tmp_path / "s.h5").exists()
 
 
 def test_a_folder_in_the_way_is_left_alone(skin, tmp_path):

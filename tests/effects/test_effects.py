@@ -246,14 +246,53 @@ def test_an_effect_refuses_a_negative_scatter_length_or_time(effect):
         if not isinstance(value, jax.Array):
             continue
         if field.name in SIGNED or (kind is fx.ClockError and field.name == "offset"):
-            kind(**{field.name: -jnp.ones_like(value)})
+            kind(**{field.name: -1e-3 * jnp.ones_like(value)})
             continue
         for wrong in (-jnp.ones_like(value), np.full(value.shape, np.nan)):
             if value.dtype.kind == "f" or not np.isnan(wrong).any():
                 with pytest.raises(
-                    je.effects.EffectError, match=f"{kind.__name__}: {field.name} is (-1|nan)( m|); give (at|0 to 1 m)"
+                    je.effects.EffectError,
+                    match=f"{kind.__name__}: {field.name} is (-1|nan)( m|); give (at least|more than|[01] to) ",
                 ):
                     kind(**{field.name: wrong})
+
+
+# Well formed, but the law has no value there or turns what it acts on into infinite numbers or none.
+ABSURD = {
+    "CoatingNonUniformity": {"std": 99.0},
+    "ContactGain": {"length": 0.0},
+    "ContactPiezoresistance": {"half_pressure": 0.0},
+    "HomogenisedIslands": {"fraction": 99.0},
+    "ContinuousCoating": {"resistance": 0.0},
+    "ProtrusionGrid": {"side": 7e-3},
+    "SheetTemperature": {"coefficient": -1.0},
+    "Hysteresis": {"reach": 1.0},
+    "Creep": {"onset": 0.0},
+    "LoadSpreading": {"width": 0.0},
+    "PadEdgeDip": {"width": 0.0},
+    "PadCrosstalk": {"fraction": 2.0},
+    "GasLaw": {"pressure": 0.0},
+    "GasRelaxation": {"gas_share": 1.5},
+    "TpuRelaxation": {"shares": [0.1, 0.2]},
+    "ElectrodeFault": {"electrode": []},
+    "Noise": {"std": np.inf},
+    "Quantisation": {"lowest": 1.0, "highest": 1.0},
+    "AdcRanges": {"gains": []},
+    "DropOut": {"probability": 1.5},
+    "ClockError": {"skew": -1.0},
+}
+
+
+@pytest.mark.parametrize("name", ABSURD)
+def test_an_effect_refuses_what_cannot_be(name):
+    given = {key: np.asarray(value) for key, value in ABSURD[name].items()}
+    with pytest.raises(je.effects.EffectError, match=f"{name}: {next(iter(given))} is .*; give "):
+        je.effects.EFFECTS[name](**given)
+
+
+def test_maxwell_elements_that_carry_nothing_are_refused():
+    with pytest.raises(je.effects.EffectError, match="as many shares as times, with a sum below 1"):
+        je.effects.TpuRelaxation(shares=jnp.array([0.5, 0.3, 0.2]))
 
 
 def test_a_scene_file_refuses_a_negative_scatter():
@@ -311,7 +350,7 @@ def test_scenes_refuse_what_is_not_an_effect(skin):
         ({"type": "Quantisation"}, "step: Quantisation has no usual value"),
         ({"width": 1.0}, "type: missing"),
         ({"type": "AdcRanges", "gains": 2.0}, "gains: is 2.0; give "),
-        ({"type": "LoadSpreading", "width": 8.0}, "width is 8 m; give 0 to 1 m"),
+        ({"type": "LoadSpreading", "width": 8.0}, "width is 8 m; give more than 0 to 1 m"),
         ({"type": "ElectrodeFault", "electrode": 1.5}, "electrode: is 1.5; give a whole number"),
     ],
 )
