@@ -30,6 +30,7 @@ Example:
 """
 
 from .loads import (
+    ForceLaw,
     LoadFitter,
     LoadKind,
     Loads,
@@ -54,6 +55,7 @@ __all__ = [
     "ContactResult",
     "ContactSettings",
     "Contacts",
+    "ForceLaw",
     "LoadFitter",
     "LoadKind",
     "LoadSettings",

@@ -146,6 +146,11 @@ def test_what_was_learned_is_told_in_one_line():
         "pressure adds up to 150 % of conductivity, half of that at 25 kPa (exponent 1.10); texture 0.20, "
         "model error 0.5 %"
     )
+    forces = je.contacts.ForceLaw(logs=(0.0, 0.0, np.log(1.2)))
+    assert (
+        "kPa (exponent 1.10), and for the forces told up to 150 % of conductivity, half of that at 25 kPa "
+        "(exponent 1.32); texture" in render_loads(replace(learned, forces=forces))
+    )
 
 
 @pytest.fixture(scope="module")

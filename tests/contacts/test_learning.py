@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from jaxeit.contacts import LoadKind, LoadSettings, learn_loads, prepare_loads
+from jaxeit.contacts import ForceLaw, LoadKind, LoadSettings, learn_loads, prepare_loads
 from jaxeit.contacts.loads import learning
 from jaxeit.contacts.loads.comparison import Comparison, Fit
 from jaxeit.contacts.loads.model_error import LAST, STEP, fitted_model_error
+from jaxeit.contacts.loads.sheet import scaled_law
 from jaxeit.imaging import InverseError
 from tests.compiled import compiled
 
@@ -86,6 +87,49 @@ def test_a_frame_that_is_not_of_its_press_is_left_out(ready, monkeypatch):
     learned = learn_loads(model, mixed, PLACES, FORCES, noise=noise, untouched=blank)
     truth = change(je.effects.ContactPiezoresistance(*LAW))
     assert np.abs(np.log(change(learned.law) / truth)).max() < 0.15
+
+
+def test_forces_are_told_by_the_law_that_single_presses_follow(monkeypatch):
+    """A regression on the slopes of found forces: the law is found, one wrong force in sixteen counts little, and the
+    scatter of the others is the stated one."""
+    rng, truth = np.random.default_rng(3), np.array([0.2, -0.1, 0.25])
+    slopes = rng.uniform([1.0, -1.1, -2.0], [1.5, -0.9, -0.4], (64, 3))
+    missed = slopes @ truth + 0.07 * rng.normal(size=64)
+    missed[5] += np.log(5)
+    law = learning.regressed_force_law(missed, np.full(64, 0.14**2), slopes)
+    off = slopes @ (np.array(law.logs) - truth)
+    assert np.abs(off).max() < 0.06
+    stated = np.sqrt(np.einsum("ni,ij,nj->n", slopes, np.array(law.covariance), slopes))
+    assert np.abs(off / stated).max() < 2
+    assert law.variance == pytest.approx(0.3, rel=0.4)  # half the stated deviation; without the one, a quarter
+    assert "exponent times 1." in str(law)
+
+
+def test_a_force_is_told_by_its_law_and_the_rest_of_a_load_stays(ready):
+    """To first order, as a fit under that law tells it."""
+    fitter, finder, frames, _ = ready
+    search = Comparison(fitter, fitter.whitened(frames[0], 0), finder(frames[0]))
+    fit, logs = search.one(), np.array([0.02, -0.01, 0.015])
+    law = replace(
+        fitter, force_logs=jnp.asarray(logs), force_covariance=0.01 * jnp.eye(3), force_variance=jnp.asarray(0.5)
+    )
+    told, plain = Comparison(law, search.y, None).shape(LoadKind.ONE, fit), search.shape(LoadKind.ONE, fit)
+    np.testing.assert_array_equal(told.position, plain.position)
+    np.testing.assert_array_equal(told.width, plain.width)
+    np.testing.assert_allclose(told.position_covariance, plain.position_covariance, rtol=1e-12)
+    assert told.covariance[3, 3] > 0.5 * plain.covariance[3, 3]
+    sheet = replace(fitter.sheet, law=scaled_law(fitter.sheet.law, logs.tolist()))
+    other = Comparison(replace(fitter, sheet=sheet), search.y, None).fit(LoadKind.ONE, fit.loads[:1, :4], 1e-6)
+    again = search.fit(LoadKind.ONE, fit.loads[:1, :4], 1e-6)
+    change = other.loads[0, 3] - again.loads[0, 3]
+    assert np.log(told.force[0] / plain.force[0]) == pytest.approx(change, rel=0.2)
+    assert abs(change) > 0.01
+
+
+@pytest.mark.parametrize("wrong", [{"logs": (0.1, 0.2)}, {"variance": 0.0}, {"logs": (np.nan, 0.0, 0.0)}])
+def test_a_law_of_forces_is_three_finite_logs(wrong):
+    with pytest.raises(InverseError, match="are no law of forces; give three finite logs"):
+        ForceLaw(**wrong)
 
 
 @pytest.mark.parametrize("loads", [(SPOT,), (LONG,)], ids=["one", "edge"])
@@ -178,6 +222,7 @@ def test_presses_that_tell_nothing_are_not_counted(ready, monkeypatch):
         found = iter(evidences)
         monkeypatch.setattr(learning, "prepare_loads", lambda *_, **__: fitter)
         monkeypatch.setattr(learning, "_fitted_law", lambda *_: (np.zeros(3), [Fit(np.zeros((3, 6)), 0.0, None, None)]))
+        monkeypatch.setattr(learning, "_force_law", lambda *_: ForceLaw())
         monkeypatch.setattr(learning, "_model_error", lambda *_: (0.01, np.array([*next(found), *np.zeros(5)])))
         return learn_loads(fitter.sheet.model, frames, PLACES, FORCES, noise=noise)
 

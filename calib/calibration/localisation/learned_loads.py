@@ -6,6 +6,7 @@ import numpy as np
 
 import jaxeit as je
 from jaxeit.contacts import LoadSettings
+from jaxeit.contacts.loads.sheet import scaled_law
 
 from ..calibration import Calibration
 
@@ -37,9 +38,14 @@ def learned_loads(calibration: Calibration, model: je.Model, known: dict[str, An
 
 def render_loads(loads: LoadSettings) -> str:
     """What was learned of loads, in one line."""
-    law = loads.law
+    line = f"pressure adds {_law_text(loads.law)}"
+    if any(loads.forces.logs):
+        line += f", and for the forces told {_law_text(scaled_law(loads.law, loads.forces.logs))}"
+    return f"{line}; texture {loads.texture:.2f}, model error {100 * loads.model_error:.1f} %"
+
+
+def _law_text(law: je.effects.ContactPiezoresistance) -> str:
     return (
-        f"pressure adds up to {100 * float(law.amplitude):.0f} % of conductivity, half of that at "
-        f"{1e-3 * float(law.half_pressure):.0f} kPa (exponent {float(law.exponent):.2f}); texture {loads.texture:.2f}, "
-        f"model error {100 * loads.model_error:.1f} %"
+        f"up to {100 * float(law.amplitude):.0f} % of conductivity, half of that at "
+        f"{1e-3 * float(law.half_pressure):.0f} kPa (exponent {float(law.exponent):.2f})"
     )

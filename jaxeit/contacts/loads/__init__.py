@@ -5,9 +5,10 @@ from .learning import learn_loads
 from .preparation import prepare_loads
 from .proposal import Proposal, Proposed, load_proposal, shipped_proposal
 from .result import LoadKind, Loads, LoadShape
-from .settings import LoadSettings
+from .settings import ForceLaw, LoadSettings
 
 __all__ = [
+    "ForceLaw",
     "LoadFitter",
     "LoadKind",
     "LoadSettings",

@@ -10,8 +10,8 @@ from scipy.linalg import solve_triangular
 from scipy.stats import norm
 
 from ..result import Contacts
-from .considered import Known, inverse_of, mean_errors
-from .pressure import MOST, SIZE, Form
+from .considered import Known, inverse_of, mean_errors, slopes_in_law
+from .pressure import FORCE, MOST, SIZE, Form
 from .programs import Problem, before, fit_loads, unknowns_of
 from .proposal import Proposed
 from .result import LoadKind, Loads, LoadShape
@@ -43,6 +43,7 @@ TRUST = 0.3
 # moves. The whole step makes tilted tips better and rings worse, whose moments are too large for slopes; half of it
 # makes neither worse.
 MOVED, FAR = 0.5, 0.5
+MOST_TOLD = 0.7  # change of the log of a force by `ForceLaw`, at most: its law is to first order
 MIN_SHARE = 0.15  # of the force, that the weaker of two ends of an edge bears
 
 
@@ -265,17 +266,32 @@ class Comparison:
 
     def shape(self, kind: LoadKind, fit: Fit) -> LoadShape:
         """Loads as they are handed out."""
-        rows, free = fit.loads[: len(FORMS[kind])], self.free(kind, fit)
-        y, forms, root, loads = self.put(self.y, padded(rows, kind)[1], fit.root, fit.loads)
-        surprise, slopes = map(np.asarray, before(Problem(self.fitter, y, forms, root), loads))
-        misfit = np.array((fit.square - surprise @ surprise) / len(self.y))
-        end = unknowns_of(self.fitter, loads, forms)
-        known = Known(self.y, end, self.errors(end), surprise, slopes[:, free])
+        rows, free, known = fit.loads[: len(FORMS[kind])], self.free(kind, fit), self.known(kind, fit)
+        misfit = np.array((fit.square - known.surprise @ known.surprise) / len(self.y))
         mean, square = mean_errors(known, free, np.asarray(self.fitter.shapes, float))
         step = self.step(rows, mean) if kind is LoadKind.ONE else np.zeros(len(mean))
         covariance = square - np.outer(mean, step) - np.outer(step, mean) + np.outer(step, step)
-        parts = rows[:, :2] + step[:2], np.exp(rows[:, 2]), np.exp(rows[:, 3]), rows[:, 4:], covariance
+        told, covariance = self.forces(known, free, covariance)
+        parts = rows[:, :2] + step[:2], np.exp(rows[:, 2]), np.exp(rows[:, 3] + told), rows[:, 4:], covariance
         return LoadShape(*self.put(*parts, misfit))
+
+    def known(self, kind: LoadKind, fit: Fit) -> Known:
+        """What is known at the loads of a fit."""
+        forms = padded(fit.loads[: len(FORMS[kind])], kind)[1]
+        y, form, root, loads = self.put(self.y, forms, fit.root, fit.loads)
+        surprise, slopes = map(np.asarray, before(Problem(self.fitter, y, form, root), loads))
+        end = unknowns_of(self.fitter, loads, form)
+        return Known(self.y, end, self.errors(end), surprise, slopes[:, self.free(kind, fit)])
+
+    def forces(self, known: Known, free: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Change of the logs of the forces by `ForceLaw`, (n,), and the covariance of all parameters after it."""
+        law, at = self.fitter, np.flatnonzero(np.flatnonzero(free) % SIZE == FORCE)
+        logs, unsure = (np.asarray(part, float) for part in (law.force_logs, law.force_covariance))
+        slopes, scale = slopes_in_law(known, free)[at], np.ones(len(covariance))
+        scale[at] = np.sqrt(float(law.force_variance))
+        covariance = covariance.copy()
+        covariance[np.ix_(at, at)] += slopes @ unsure @ slopes.T
+        return np.clip(-(slopes @ logs), -MOST_TOLD, MOST_TOLD), covariance * np.outer(scale, scale)
 
     def step(self, rows: np.ndarray, mean: np.ndarray) -> np.ndarray:
         """By how much a single load is handed out elsewhere than the fit has it, where its mean error is known.

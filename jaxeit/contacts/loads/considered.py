@@ -70,6 +70,20 @@ def mean_errors(
     return weight @ away, np.einsum("g,gij->ij", weight, square)
 
 
+def slopes_in_law(known: Known, free: np.ndarray) -> Float[np.ndarray, "m 3"]:
+    """By how much the parameters that are free are found otherwise, where the law is another one than that of the fit.
+
+    Slopes in the logs of the law's amplitude, half pressure and exponent. With the readings' slopes J in the parameters
+    and L in these logs, and what is known of loads before, they are those of the solution of least squares, the
+    readings being those of the true law.
+    """
+    both = np.concatenate([np.asarray(known.end.loads)[:, free], np.asarray(known.end.law)], 1)
+    white = solve_triangular(known.root, both.astype(float), lower=True)
+    loads, law = white[:, :-3], white[:, -3:]
+    found: np.ndarray = inverse_of(loads.T @ loads + known.slopes.T @ known.slopes)[0] @ (loads.T @ law)
+    return found
+
+
 def _variances(shapes: Float[np.ndarray, " k"], count: int, more: int) -> Float[np.ndarray, "g q"]:
     """Variances of moments, of all pairs of factors, over those that the root of the errors holds already."""
     even, odd = (factor.reshape(-1, 1) ** 2 for factor in np.meshgrid(shapes, shapes))

@@ -45,6 +45,7 @@ class LoadFitter(eqx.Module):
     | difference: standard deviation of their differences between loads   | (2,)             |      |
     | least: distance of two loads, length of an edge, that is not one load | (2,)           | m    |
     | length, prior, model_error, shapes: see `LoadSettings`              | (), (5,), (), (factors,) | |
+    | force_logs, force_covariance, force_variance: see `ForceLaw`        | (3,), (3, 3), () |      |
 
     Example:
         settings = je.contacts.LoadSettings(force=5.0)  # N, usual here
@@ -68,6 +69,9 @@ class LoadFitter(eqx.Module):
     prior: Float[Array, "5"]
     model_error: Float[Array, ""]
     shapes: Float[Array, " factors"]
+    force_logs: Float[Array, "3"]
+    force_covariance: Float[Array, "3 3"]
+    force_variance: Float[Array, ""]
 
     def __call__(self, dv: Float[ArrayLike, " readings"], contacts: Contacts) -> Loads:
         """Loads of one difference frame (readings,) V, from the contacts that a `ContactFinder` saw in it.

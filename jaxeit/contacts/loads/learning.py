@@ -11,6 +11,12 @@ where R is the covariance of what a fit errs by, gain and shape of the load amon
 what is known of laws before. The loads are eliminated from each step (Golub and Pereyra 1973, SIAM J. Numer. Anal. 10,
 413). A press that fits far worse than most, as one whose frame is not its own, is left out.
 
+Fits of weak or long loads seldom find their end under a law of a large exponent, so that S holds the exponent near
+one, and weak presses are told too weak, strong ones too strong. By how much the fits of presses, as if their force were
+unknown, miss it, tells the law by which the forces of fits are told (`ForceLaw`): a regression on the slopes of the
+found force in the logs of the law, with errors of Student's law (Lange, Little and Taylor 1989, J. Am. Stat. Assoc. 84,
+881), so that a press whose force is stated wrong counts little.
+
 What the law leaves has two parts. Protrusions, and loads that are not Gaussians, are like a gain that changes over a
 few millimetres: its standard deviation, the texture, is the one under which all presses together are most probable.
 What is left even so is the model error (`fitted_model_error`).
@@ -30,12 +36,14 @@ from ..._compile import require_known
 from ...imaging.noise import InverseError
 from ...model.discretisation import Model
 from .comparison import LAST_FALL, Comparison, Fit, improbability, padded
+from .considered import inverse_of, slopes_in_law
 from .fitter import LoadFitter
 from .model_error import fitted_model_error
 from .preparation import AbstractGain, prepare_loads, texture_modes
+from .pressure import FORCE
 from .programs import Problem, before
 from .result import LoadKind
-from .settings import LoadSettings
+from .settings import ForceLaw, LoadSettings
 from .sheet import scaled_law
 
 # Standard deviations of the logs of amplitude, half pressure and exponent before any press. Amplitude and half pressure
@@ -52,6 +60,11 @@ SURELY = 2.0
 # Steps of the law under each texture; how often one is halved; largest change of a log in a step, and the one below
 # which steps end.
 STEPS, HALVINGS, MOST_STEP, LEAST_STEP = 4, 2, 0.7, 0.03
+# Standard deviations of the logs of amplitude, half pressure and exponent, by which the law of forces differs.
+FORCE_SPREAD = np.array([0.3, 0.3, 0.5])
+# Degrees of freedom of the errors of told forces; number of presses that count as much as what fits state of these.
+FREEDOM, STATED = 4, 8
+REWEIGHTED = 30  # times that presses are weighed, of which a few suffice
 # Chi-square of a press over the median, beyond which it is left out.
 UNUSUAL = 5.0
 
@@ -71,8 +84,8 @@ def learn_loads(
 ) -> LoadSettings:
     """Settings of loads for `prepare_loads`, by presses of known place and force.
 
-    The law of pressure, the texture of the gain and the model error are learned; the other settings stay. Give presses
-    of several forces all over the sheet: one force alone tells one number of the law.
+    The law of pressure, the law of forces, the texture of the gain and the model error are learned; the other settings
+    stay. Give presses of several forces all over the sheet: one force alone tells one number of the law.
 
     Args:
         dv: difference frames, (n, readings) V, in each of which one tip presses, as means over holds.
@@ -99,10 +112,10 @@ def learn_loads(
     require_known("learn_loads", InverseError, dv, position, force)
     frames, places, forces = (np.asarray(values, float) for values in (dv, position, force))
     _require_presses(frames, places, forces)
-    usual = settings or LoadSettings()
+    usual = replace(settings or LoadSettings(), forces=ForceLaw())
     fitter = prepare_loads(model, usual, noise=noise, untouched=untouched, sigma=sigma, channels=channels, gain=gain)
     presses = _Presses(fitter, np.stack([fitter.whitened(frame, 0) for frame in frames]), np.log(forces))
-    learned, best, logs, counted = usual, -np.inf, np.zeros(3), np.ones(len(forces), bool)
+    learned, final, best, logs, counted = usual, presses, -np.inf, np.zeros(3), np.ones(len(forces), bool)
     starts = list(np.column_stack([places, np.full(len(forces), np.log(usual.width)), np.log(forces)])[:, None])
     for texture in TEXTURES:
         tried = replace(usual, texture=texture)
@@ -115,8 +128,8 @@ def learn_loads(
         if not (evidence := float(evidences[counted].sum())) > best:
             break
         learned, best = replace(tried, law=under.fitter.sheet.law, model_error=error), evidence
-        starts = [fit.loads[:1, :4] for fit in fits]
-    return learned
+        starts, final = [fit.loads[:1, :4] for fit in fits], under.with_error(error)
+    return replace(learned, forces=_force_law(final, starts, counted))
 
 
 def _require_presses(frames: np.ndarray, places: np.ndarray, forces: np.ndarray) -> None:
@@ -160,6 +173,11 @@ class _Presses(NamedTuple):
         sheet = self.fitter.sheet
         return self._with_sheet(texture=texture_modes(sheet.points, sheet.weights, settings, sheet.gain.dtype))
 
+    def with_error(self, error: float) -> "_Presses":
+        """The presses under another model error."""
+        found = jnp.asarray(error, self.fitter.model_error.dtype)
+        return self._replace(fitter=replace(self.fitter, model_error=found))
+
     def _with_sheet(self, **parts: Any) -> "_Presses":
         return self._replace(fitter=replace(self.fitter, sheet=replace(self.fitter.sheet, **parts)))
 
@@ -171,6 +189,14 @@ class _Presses(NamedTuple):
     def fits(self, starts: list[np.ndarray]) -> list[Fit]:
         """One load for each press, from where it begins, (1, 4)."""
         return [self.search(k).fit(LoadKind.ONE, start, LAST_FALL) for k, start in enumerate(starts)]
+
+    def missed(self, k: int, start: np.ndarray) -> tuple[float, float, np.ndarray]:
+        """Log of the force of one press that its readings tell, over the true one; its variance, its slopes (3,)."""
+        search = Comparison(self.fitter, self.y[k], None)
+        fit = search.fit(LoadKind.ONE, start, LAST_FALL)
+        free, told = search.free(LoadKind.ONE, fit), search.shape(LoadKind.ONE, fit)
+        slopes = slopes_in_law(search.known(LoadKind.ONE, fit), free)[FORCE]
+        return np.log(float(told.force[0])) - self.log_force[k], float(told.covariance[FORCE, FORCE]), slopes
 
     def normal(self, fits: list[Fit], kept: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Normal matrix (3, 3) and gradient (3,) of some presses in the logs of the law, in which loads give way."""
@@ -221,6 +247,33 @@ def _fitted_law(presses: _Presses, logs: np.ndarray, starts: list[np.ndarray]) -
         if np.abs(step).max() < LEAST_STEP:
             break
     return logs, fits
+
+
+def _force_law(presses: _Presses, starts: list[np.ndarray], counted: np.ndarray) -> ForceLaw:
+    """The law by which the forces of fits are told, by what fits of presses find where the force is not known."""
+    told = [presses.missed(k, starts[k]) for k in np.flatnonzero(counted).tolist()]
+    missed, variance, slopes = (np.array([one[part] for one in told]) for part in range(3))
+    return regressed_force_law(missed, variance, slopes)
+
+
+def regressed_force_law(
+    missed: Float[np.ndarray, " n"], variance: Float[np.ndarray, " n"], slopes: Float[np.ndarray, "n 3"]
+) -> ForceLaw:
+    """The law of forces under which those that fits find are least surprising.
+
+    Args:
+        missed, variance: logs of found forces over the true ones, and their variances, as fits state them.
+        slopes: of the logs of found forces in those of the law.
+    """
+    variance, weight = variance + FORCE_ERROR**2, np.ones(len(missed))
+    for _ in range(REWEIGHTED):
+        weighed = slopes * (weight / variance)[:, None]
+        covariance = inverse_of(slopes.T @ weighed + np.diag(FORCE_SPREAD**-2.0))[0]
+        logs = covariance @ weighed.T @ missed
+        squares = (missed - slopes @ logs) ** 2 / variance
+        weight = (FREEDOM + 1) / (FREEDOM + squares)
+    over = (STATED + float(weight @ squares)) / (STATED + len(missed))
+    return ForceLaw(tuple(logs.tolist()), tuple(map(tuple, covariance.tolist())), over)
 
 
 def _model_error(fitter: LoadFitter, y: np.ndarray, fits: list[Fit]) -> tuple[float, np.ndarray]:

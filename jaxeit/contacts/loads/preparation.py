@@ -83,6 +83,9 @@ def prepare_loads(
         prior=put(settings.prior),
         model_error=put(settings.model_error),
         shapes=put(settings.shapes),
+        force_logs=put(settings.forces.logs),
+        force_covariance=put(settings.forces.covariance),
+        force_variance=put(settings.forces.variance),
     )
 
 

@@ -16,6 +16,7 @@ from jax.scipy.special import erf
 from jaxtyping import Array, Bool, Float, Int
 
 MOST, SIZE = 3, 6  # loads, and parameters of each
+FORCE = 3  # of these the log of the force
 ROW = (-0.8, 0.0, 0.8)  # of the half length, places of the round loads that an edge is a row of
 LOG_ROW = np.array([0, 0, 0, np.log(len(ROW)), 0, 0])  # by which each of them is weaker
 SQRT_2, SQRT_3 = math.sqrt(2), math.sqrt(3)

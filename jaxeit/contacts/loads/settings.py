@@ -17,12 +17,49 @@ NO_EDGE = (0.25, 0.25, 0.25, 0.0, 0.25)
 
 
 @dataclass(frozen=True)
+class ForceLaw:
+    """By what the law that tells forces differs from the law under which loads are fitted; made by `learn_loads`.
+
+    Fits of weak or long loads seldom find their end under a law of a large exponent. So they are made under a gentle
+    one, and the forces that they end with are told by this law, to first order.
+
+    | meaning                                                                       | default | shape  |
+    |-------------------------------------------------------------------------------|---------|--------|
+    | logs: of amplitude, half pressure and exponent, over those of the fits        | 0       | (3,)   |
+    | covariance of these logs                                                      | 0       | (3, 3) |
+    | variance: of the log of a force, over that which the fit states               | 1       |        |
+
+    Raises:
+        InverseError: for numbers that are not finite, or a variance that is not above zero.
+    """
+
+    logs: tuple[float, ...] = (0.0, 0.0, 0.0)
+    covariance: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0),) * 3
+    variance: float = 1.0
+
+    def __post_init__(self) -> None:
+        logs, covariance = np.asarray(self.logs, float), np.asarray(self.covariance, float)
+        finite = np.isfinite(logs).all() and np.isfinite(covariance).all()
+        if logs.shape != (3,) or covariance.shape != (3, 3) or not finite or not 0 < self.variance < np.inf:
+            given = f"logs {self.logs}, covariance {self.covariance} and variance {self.variance}"
+            raise InverseError(f"{given} are no law of forces; give three finite logs, (3, 3), and a number above zero")
+
+    def __str__(self) -> str:
+        amplitude, half_pressure, exponent = (f"{np.exp(log):.3g}" for log in self.logs)
+        return (
+            f"amplitude times {amplitude}, half_pressure times {half_pressure}, exponent times {exponent}, "
+            f"variance times {self.variance:.2g}"
+        )
+
+
+@dataclass(frozen=True)
 class LoadSettings:
     """Prior knowledge of loads, and the response of the sheet to pressure.
 
     | meaning                                                                      | default      | unit |
     |------------------------------------------------------------------------------|--------------|------|
     | law: factor of conductivity by pressure                                      | Hill, 20 kPa |      |
+    | forces: by what the law that tells forces differs (`learn_loads`)            | by nothing   |      |
     | gain: standard deviation of the log gain of the contact layer                | 0.12         | 1    |
     | gain_length: over which it changes                                           | 0.015        | m    |
     | texture: standard deviation of the log gain of protrusions and of what loads | 0            | 1    |
@@ -56,6 +93,7 @@ class LoadSettings:
     """
 
     law: ContactPiezoresistance = field(default_factory=ContactPiezoresistance)
+    forces: ForceLaw = ForceLaw()
     gain: float = 0.12
     gain_length: float = 0.015
     texture: float = 0.0
