@@ -434,7 +434,11 @@ def _utc(path: Path, epoch: datetime) -> str:
     """ISO text in UTC with microseconds; refuses a time without zone."""
     if epoch.tzinfo is None:
         raise problem(path, "epoch", "has no time zone", "give datetime(..., tzinfo=UTC)")
-    return epoch.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+    try:
+        moment = epoch.astimezone(UTC)
+    except OverflowError:
+        raise problem(path, "epoch", "lies outside of the years 1 to 9999 of UTC", "correct the epoch") from None
+    return moment.replace(tzinfo=None).isoformat(timespec="microseconds") + "Z"  # strftime drops zeros of the year
 
 
 def _write_mixing(group: h5py.Group, mixing: sp.csr_array) -> None:

@@ -356,3 +356,29 @@ def test_a_header_that_contradicts_the_command_is_named(header, said, tmp_path, 
     brought(path, "--time", "time:s", "--stream", "force=1:N" if "_m" in header else "force=force:N")
     text = capsys.readouterr().out
     assert (f"warning: log.csv: {said}" in text) if said else ("header says" not in text)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--time", "t:s"], "times from 1.7e+12 to 1.7e+12 s cannot be kept"),
+        (["--rate", "100", "--start", "1e12"], "check --rate, --start"),
+        (["--rate", "1e-300"], "check --rate, --start"),
+        (["--rate", "1e300"], "cannot be kept in nanoseconds; check --rate, --start"),
+        (["--rate", "100", "--start", "nan"], "--start nan: not usable; give a finite number"),
+        (["--rate", "100", "--epoch", "0001-01-01T00:00:00+14:00"], "lies outside of the years 1 to 9999 of UTC"),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_times_that_no_calendar_has_end_in_one_line(words, said, tmp_path, capsys):
+    path = written(tmp_path, "t,force\n" + "".join(f"{1_700_000_000_000 + 10 * k},{k % 7}\n" for k in range(50)))
+    line = refusal(capsys, path, *words, "--stream", "force=force:N")
+    assert said in line
+    assert "above zero" not in line
+
+
+def test_the_first_year_has_four_digits(tmp_path):
+    path = written(tmp_path, "t,force\n" + "".join(f"{k / 100},{k % 7}\n" for k in range(50)))
+    brought(path, "--time", "t:s", "--stream", "force=force:N", "--epoch", "0001-01-01T00:00:00Z")
+    with open_session(path.with_name("s.h5")) as session:
+        assert session.epoch.startswith("0001-01-01T00:00:00")

@@ -2,7 +2,7 @@
 
 import argparse
 from abc import ABC, abstractmethod
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
@@ -74,4 +74,10 @@ def parse_epoch(text: str | None) -> datetime | None:
         moment = None
     if moment is None or moment.tzinfo is None:
         raise SessionError(f"--epoch {printable(text)}: not a time; write it as 2025-01-31T12:00:00Z")
+    try:
+        moment.astimezone(UTC)
+    except OverflowError:
+        raise SessionError(
+            f"--epoch {printable(text)}: lies outside of the years 1 to 9999 of UTC; correct it"
+        ) from None
     return moment

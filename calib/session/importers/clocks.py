@@ -14,17 +14,23 @@ from .tables import Table
 
 UNIX_TIME_FROM = 1e8
 """Readings in s above this value (1973) are taken as times since 1970, smaller ones as times since an unknown start."""
+LAST_TIME = 253_402_300_800.0
+"""End of the year 9999 in s since 1970: later times have no date, and are those of another unit."""
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Rows that are kept, in order, their times in s, and what was left out."""
+    """Rows that are kept, in order, their times in s, and what was left out.
+
+    ``remedy`` says what to check if the times cannot be kept.
+    """
 
     rows: np.ndarray
     seconds: np.ndarray
     without: np.ndarray
     equal: np.ndarray
     sorted: int
+    remedy: str = "check the unit of --time"
 
     @property
     def counts_from_1970(self) -> bool:
@@ -49,7 +55,7 @@ def clock_of(path: Path, table: Table, column: str, unit: Unit, sort: bool, coun
     if len(kept) < 2 or len(without) > len(seconds) // 2:
         what = f"only {len(kept):,} of {len(seconds):,} rows have a time of their own"
         raise problem(path, f"column {column}", what, "check the clock's column, and the file")
-    return Clock(kept, seconds[kept], without, np.sort(rows[repeat]), len(back))
+    return _dated(path, Clock(kept, seconds[kept], without, np.sort(rows[repeat]), len(back)))
 
 
 def clock_of_rate(path: Path, rows: int, rate_hz: float, start: float) -> Clock:
@@ -57,7 +63,18 @@ def clock_of_rate(path: Path, rows: int, rate_hz: float, start: float) -> Clock:
     if rows < 2:
         raise problem(path, "file", f"holds {rows} rows", "give a table of at least two rows")
     none = np.empty(0, np.int64)
-    return Clock(np.arange(rows), start + np.arange(rows) / rate_hz, none, none, 0)
+    with np.errstate(over="ignore"):
+        seconds = start + np.arange(rows) / rate_hz
+    return _dated(path, Clock(np.arange(rows), seconds, none, none, 0, "check --rate, --start"))
+
+
+def _dated(path: Path, clock: Clock) -> Clock:
+    """The clock; raises `SessionError` if one of its times has no date."""
+    first, last = float(clock.seconds[0]), float(clock.seconds[-1])
+    if not max(abs(first), abs(last)) < LAST_TIME:
+        what = f"times from {first:.4g} to {last:.4g} s cannot be kept: the year 9999 ends at {LAST_TIME:.4g} s"
+        raise problem(path, "clock", what, clock.remedy)
+    return clock
 
 
 def join_clocks(paths: Sequence[Path], clocks: Sequence[Clock], gap: float | None) -> list[Clock]:
@@ -74,7 +91,8 @@ def join_clocks(paths: Sequence[Path], clocks: Sequence[Clock], gap: float | Non
             what = f"begins at {first:g} s, and {before.name} ends at {end:g} s"
             raise problem(path, "clock", what, "give the files in order; for clocks that start anew give --gap SECONDS")
         shift = 0.0 if gap is None else end + gap - first
-        joined.append(replace(clock, seconds=clock.seconds + shift))
+        remedy = clock.remedy if gap is None else f"{clock.remedy}, --gap"
+        joined.append(_dated(path, replace(clock, seconds=clock.seconds + shift, remedy=remedy)))
     return joined
 
 
@@ -98,5 +116,5 @@ def nanoseconds(path: Path, clock: Clock, zero: float) -> np.ndarray:
     """Times in ns since the clock's reading ``zero`` in s; raises `SessionError` where they do not fit int64."""
     times = np.rint((clock.seconds - zero) * 1e9)
     if np.abs(times).max() >= 2.0**62 or (np.diff(times) <= 0).any():
-        raise problem(path, "clock", "cannot be kept in nanoseconds", "check the unit of --time")
+        raise problem(path, "clock", "cannot be kept in nanoseconds", clock.remedy)
     return times.astype(np.int64)

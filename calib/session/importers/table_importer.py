@@ -120,4 +120,5 @@ def _file_spec(group: _Group) -> FileSpec:
 
 def _check_number(option: str, value: float | None) -> None:
     if value is not None and not (math.isfinite(value) and (value > 0 or option == "start")):
-        raise SessionError(f"--{option} {value:g}: not usable; give a finite number above zero")
+        wanted = "a finite number" if option == "start" else "a finite number above zero"
+        raise SessionError(f"--{option} {value:g}: not usable; give {wanted}")
