@@ -4,6 +4,7 @@ import os
 import struct
 import zipfile
 from dataclasses import replace
+from datetime import date, time, timedelta
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -169,6 +170,50 @@ def test_times_of_numpy_count_from_1970(tmp_path):
     np.testing.assert_allclose(found["force.time"], 250_000_000 + np.arange(6) * 125_000_000, atol=500)
     with open_session(tmp_path / "s.h5") as session:
         assert session.epoch.startswith("2025-01-31T12:00:00")
+
+
+@pytest.fixture
+def kinds(tmp_path):
+    """A Parquet file of columns of text, dates, durations, times of the day and dictionaries."""
+    arrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    count = range(len(FORCE))
+    columns = {
+        "label": arrow.array([f"press {k}" for k in count]),
+        "pair": arrow.array([[1.0] * k for k in count]),
+        "f": arrow.array(FORCE, from_pandas=True),
+        "coded": arrow.array([f"{k % 2}" for k in count]).dictionary_encode(),
+        "level": arrow.array([k / 2 for k in count]).dictionary_encode(),
+        "day": arrow.array([date(2025, 1, 1 + k) for k in count]),
+        "since": arrow.array([timedelta(milliseconds=500 * k) for k in count]),
+        "clock": arrow.array([time(0, 0, k) for k in count]),
+        "stamp": arrow.array([f"2025-01-31T12:00:0{k}Z" for k in count]),
+    }
+    parquet.write_table(arrow.table(columns), tmp_path / "log.parquet")
+    return tmp_path / "log.parquet"
+
+
+@pytest.mark.parametrize(
+    ("column", "step", "epoch"),
+    [("day", 86400, "2025-01-01"), ("stamp", 1, "2025-01-31"), ("since", 0.5, "1970"), ("clock", 1, "1970")],
+)
+def test_dates_and_durations_of_parquet_are_clocks(column, step, epoch, kinds, here, tmp_path):
+    found = imported("parquet", kinds, "--time", column, "--stream", "force=f:N", "--stream", "level=level:V")
+    np.testing.assert_array_equal(np.diff(found["force.time"]), step * 1e9)
+    np.testing.assert_array_equal(found["level"][:, 0], np.arange(6) / 2)
+    with open_session(tmp_path / "s.h5") as session:
+        assert session.epoch.startswith(epoch)
+
+
+@pytest.mark.parametrize(
+    ("column", "held"), [("label", "text"), ("coded", "text"), ("pair", "values of the type list<")]
+)
+def test_columns_that_are_no_numbers_say_what_they_hold(column, held, kinds, here, capsys):
+    said = refusal(capsys, "parquet", kinds, "--time", "since", "--stream", f"force={column}:N")
+    assert f"column '{column}': holds {held}" in said
+    assert "convert it to numbers, or leave it out" in said
+    assert f"column '{column}': holds" in refusal(
+        capsys, "parquet", kinds, "--time", f"{column}:s", "--stream", "f=f:N"
+    )
 
 
 def test_objects_are_never_loaded(tmp_path, capsys):

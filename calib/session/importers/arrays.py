@@ -23,11 +23,16 @@ from .tables import AbstractTableFile, Progress, Table
 
 
 class ArrayShape(NamedTuple):
-    """``rows`` and ``columns`` of an array as a table; ``unit`` is known of clocks: "s" of times since 1970."""
+    """``rows`` and ``columns`` of an array as a table.
+
+    ``unit`` is known of clocks: "s" of times since 1970. ``refused`` says what an array holds that cannot be read as
+    numbers, such as "text"; an import that names this array ends with that.
+    """
 
     rows: int
     columns: int
     unit: str = ""
+    refused: str = ""
 
 
 def table_shape(shape: Sequence[int], unit: str = "") -> ArrayShape | None:
@@ -95,8 +100,9 @@ class ArrayFile(AbstractTableFile):
         self.path, self._kind = path, kind
         found = in_child(kind, "outline", path) if kind.isolated else kind.outline(path)
         self._shapes = {name: ArrayShape(*shape) for name, shape in found.items()}
-        names = [name for name, shape in self._shapes.items() if shape.columns <= MAX_COLUMNS]
-        self._places = [(name, column) for name in names for column in range(self._shapes[name].columns)]
+        self.refused = {name: shape.refused for name, shape in self._shapes.items() if shape.refused}
+        few = {name: shape.columns for name, shape in self._shapes.items() if shape.columns <= MAX_COLUMNS}
+        self._places = [(name, i) for name, count in few.items() if name not in self.refused for i in range(count)]
         if not self._places or len(self._places) > MAX_NAMES:
             what = f"holds {len(self._places):,} columns of numbers"
             raise problem(path, "file", what, f"give a file of 1 to {MAX_NAMES:,} columns")

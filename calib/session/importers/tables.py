@@ -35,6 +35,8 @@ class AbstractTableFile(ABC):
     | counted   | what ``Table.line`` counts: "line" or "row"           |
     | dates     | columns of text that hold dates and times, read as s  |
     |           | since 1970, and whether these state a time zone       |
+    | refused   | names of columns that cannot be read as numbers, and  |
+    |           | what they hold; they are not in ``header``            |
 
     Example:
         from calib.session.importers import AbstractTableFile, AbstractTableImporter, Table
@@ -63,6 +65,7 @@ class AbstractTableFile(ABC):
     columns: int
     counted: str = "row"
     dates: Mapping[int, bool] = MappingProxyType({})
+    refused: Mapping[str, str] = MappingProxyType({})
 
     @abstractmethod
     def read(self, columns: Sequence[int], used: int, progress: Progress) -> Table:
