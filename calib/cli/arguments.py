@@ -27,6 +27,24 @@ def above_zero(text: str) -> float:
     return value
 
 
+def at_least_zero(text: str) -> float:
+    """A number of zero or more."""
+    value = float(text)
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text}: give a number of zero or more")
+    return value
+
+
+LAST_PORT = 65535
+
+
+def port(text: str) -> int:
+    """A port of TCP; 0 stands for any free one."""
+    if not (text.isascii() and text.isdecimal()) or int(text[:10]) > LAST_PORT:
+        raise argparse.ArgumentTypeError(f"{text}: give a port from 1 to {LAST_PORT}, or 0 for any free one")
+    return int(text)
+
+
 @overload
 def skin_of(name: str) -> "je.Skin": ...
 

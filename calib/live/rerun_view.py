@@ -174,7 +174,7 @@ def _connect(stream: rr.RecordingStream, where: str) -> None:
     try:
         with socket.create_connection((host, int(port)), timeout=VIEWER_TIMEOUT):
             pass
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, OverflowError) as error:
         todo = "start it (rerun --bind 127.0.0.1), or name a file: --rerun show.rrd"
         raise RerunError(f"rerun: no viewer at {where!r} ({error}); {todo}") from error
     stream.connect_grpc(f"rerun+http://{where}/proxy")

@@ -294,6 +294,29 @@ def test_what_is_not_installed_is_said(option, missing, words, calibration, monk
     assert re.search(words, line)
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--prefix", "/arm"], "--prefix: it is about topics; add --ros2 or --foxglove"),
+        (["--frame-id", "arm"], "--frame-id: it is about topics; add --ros2 or --foxglove"),
+        (["--publish-maps"], "--publish-maps: it adds to the lines of --publish; add --publish PORT"),
+    ],
+)
+def test_options_of_an_output_that_was_not_asked_for_are_refused(words, said, capsys):
+    assert main(["live", "--calibration", "c.h5", *STREAMS, *words]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
+@pytest.mark.parametrize("option", ["--port", "--publish", "--foxglove"])
+@pytest.mark.parametrize("number", ["99999", "-1", "1" * 5000, "many"])
+def test_what_is_no_port_is_refused(option, number, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["live", "--calibration", "c.h5", *STREAMS, f"{option}={number}"])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"argument {option}: {number}: give a port from 1 to 65535, or 0 for any free one" in line
+
+
 def test_what_cannot_be_sent_is_refused(calibration):
     with pytest.raises(BridgeError, match="log has no force map"):
         Bridge(stand_in(calib.LogCalibration), Recorder())

@@ -4,7 +4,7 @@ import argparse
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
-from ..arguments import above_zero, add_proposal_argument, prepare_outputs, proposal_of
+from ..arguments import above_zero, add_proposal_argument, port, prepare_outputs, proposal_of
 from ..signals import orderly_end
 from ..terminal import say
 
@@ -54,9 +54,9 @@ def _add_stream_arguments(parser: argparse.ArgumentParser) -> None:
 def _add_output_arguments(parser: argparse.ArgumentParser) -> None:
     """The page, the programs and the file that get the results."""
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on; default: this machine only")
-    parser.add_argument("--port", type=int, default=8765, help="port of the page; 0: any free port; default: 8765")
+    parser.add_argument("--port", type=port, default=8765, help="port of the page; 0: any free port; default: 8765")
     text = "send results as lines of JSON to programs that connect to this port; 0: any free port"
-    parser.add_argument("--publish", type=int, metavar="PORT", help=text)
+    parser.add_argument("--publish", type=port, metavar="PORT", help=text)
     text = "add map and image to the lines of --publish, as base64 of little-endian float32"
     parser.add_argument("--publish-maps", action="store_true", help=text)
     parser.add_argument("--json", action="store_true", help="print results as lines of JSON")
@@ -65,16 +65,17 @@ def _add_output_arguments(parser: argparse.ArgumentParser) -> None:
     text = "publish the topics of docs/ros.md as a node of ROS 2; needs ROS"
     parser.add_argument("--ros2", nargs="?", const="jaxeit", metavar="NODE", help=text)
     text = "serve the same topics to the Foxglove app on this port (default: 8766; 0: any free port)"
-    parser.add_argument("--foxglove", nargs="?", type=int, const=8766, metavar="PORT", help=text)
-    text = "first part of the topics of --ros2 and --foxglove (default: %(default)s)"
-    parser.add_argument("--prefix", default="/skin", help=text)
-    text = "frame of coordinates in which the skin lies, for --ros2 and --foxglove (default: %(default)s)"
-    parser.add_argument("--frame-id", default="skin", metavar="FRAME", help=text)
+    parser.add_argument("--foxglove", nargs="?", type=port, const=8766, metavar="PORT", help=text)
+    text = "first part of the topics of --ros2 and --foxglove (default: /skin)"
+    parser.add_argument("--prefix", help=text)
+    text = "frame of coordinates in which the skin lies, for --ros2 and --foxglove (default: skin)"
+    parser.add_argument("--frame-id", metavar="FRAME", help=text)
     parser.add_argument("-o", "--output", metavar="SESSION.h5", help="record the streams at the same time")
 
 
 def run(args: argparse.Namespace) -> int:
     """Show force maps until the user stops the command."""
+    _check_options(args)
     _set_up_process(args)
     from ...calibration import load_calibration
     from ...live.loop import LiveControl, Publish
@@ -103,6 +104,15 @@ def run(args: argparse.Namespace) -> int:
         )
     say(f"{count} frames")
     return orders.status
+
+
+def _check_options(args: argparse.Namespace) -> None:
+    """Refuse options of an output that was not asked for."""
+    if args.publish_maps and args.publish is None:
+        raise ValueError("--publish-maps: it adds to the lines of --publish; add --publish PORT, or leave it out")
+    for option, value in (("--prefix", args.prefix), ("--frame-id", args.frame_id)):
+        if value is not None and args.ros2 is None and args.foxglove is None:
+            raise ValueError(f"{option}: it is about topics; add --ros2 or --foxglove, or leave it out")
 
 
 @contextmanager
@@ -146,7 +156,8 @@ def _viewers(
         return
     from ...live.bridges import Bridge, FoxgloveServer, RosNode
 
-    options = {"prefix": args.prefix, "frame_id": args.frame_id, "track": args.track, "warn": say}
+    names = {name: value for name in ("prefix", "frame_id") if (value := getattr(args, name)) is not None}
+    options: dict[str, Any] = {"track": args.track, "warn": say, **names}
     if args.ros2 is not None:
         yield Bridge(calibration, RosNode(args.ros2), **options)
     if args.foxglove is not None:

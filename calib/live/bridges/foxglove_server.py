@@ -38,7 +38,7 @@ class FoxgloveServer(AbstractLiveSink):
             self._server = self._foxglove.start_server(
                 name=self._name, host=self._host, port=self._port, context=self._context
             )
-        except RuntimeError as error:
+        except (RuntimeError, OverflowError) as error:
             raise OSError(f"--foxglove: {self._host}:{self._port}: {error}; name another port") from error
         self.address = f"ws://{self._host}:{self._server.port}"
         return self
