@@ -131,6 +131,7 @@ def test_a_design_moves_electrodes(tmp_path, monkeypatch, capsys):
         (["--rate", "1e6"], "a reading alone takes 1e-05 s; give a lower rate"),
         (["--criterion", "best"], 'no criterion \'best\'; give one of "place-error", "d-optimal"'),
         (["--criterion", "place-error:power=-1"], "power"),
+        (["--readings", "46", "--switch", "0", "--relative-noise", "0"], "there are 45 candidates"),
         (["--readings", "9", "--switch", "9"], "before one drive has settled"),
     ],
 )

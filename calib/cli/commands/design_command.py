@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from ..arguments import above_zero, count, prepare_results, require_matplotlib_for, skin_of
+from ..arguments import above_zero, at_least_zero, count, prepare_results, require_matplotlib_for, skin_of
 from ..terminal import announce_model, progress_bar
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     time.add_argument("--readings", type=count, metavar="N", help=text)
     time.add_argument("--rate", type=above_zero, metavar="HZ", help="frames per second")
     text = "time that a change of the driven pair takes, in readings; default: 0"
-    parser.add_argument("--switch", type=above_zero, default=0.0, metavar="READINGS", help=text)
+    parser.add_argument("--switch", type=at_least_zero, default=0.0, metavar="READINGS", help=text)
     text = "readings of one drive that are taken at once, in the time of one; default: as the skin's file says, or 1"
     parser.add_argument("--sense-channels", type=count, metavar="N", help=text)
     text = f"{', '.join(CRITERIA)}; place-error:power=8 looks at the worst places; default: place-error"
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "standard deviation of a reading, V; default: 60 dB below the rms of the scan"
     parser.add_argument("--noise", type=above_zero, metavar="V", help=text)
     text = "further noise of a reading, as part of its voltage, such as 1e-3; default: 0"
-    parser.add_argument("--relative-noise", type=above_zero, default=0.0, metavar="PART", help=text)
+    parser.add_argument("--relative-noise", type=at_least_zero, default=0.0, metavar="PART", help=text)
     _add_placement_arguments(parser)
     parser.add_argument("--picture", metavar="MAP.png", help="draw the expected error over the sheet, before and after")
 
