@@ -12,7 +12,7 @@ import pytest
 import jaxeit as je
 from jaxeit.contacts import LoadKind, Proposal, Proposed, load_proposal, shipped_proposal
 from jaxeit.contacts.loads.comparison import Comparison
-from jaxeit.contacts.loads.proposal import KINDS, PARAMETERS, PROPOSALS, WEIGHTS, components
+from jaxeit.contacts.loads.proposal import KINDS, MIN_READINGS, PARAMETERS, PROPOSALS, WEIGHTS, components
 from jaxeit.imaging import InverseError
 from jaxeit.skin import parse_skin, skin_hash
 
@@ -91,6 +91,32 @@ def test_frames_unlike_the_training_are_announced(proposal):
     assert not typical(like + 1e-5 * rng.normal(size=like.shape)).outside
     assert typical(like[0] + 5e-5 * rng.normal(size=READINGS)).outside
     assert (replace(typical, limits=np.array([1e-3, 2.0]))(like).distance > 1).all()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e200, -1e17])
+@pytest.mark.parametrize("name", ["testbed", "chest"])
+def test_a_frame_that_tells_nothing_is_outside_and_no_kind_is_certain(name, value):
+    shipped = load_proposal(name)
+    frames = np.zeros((2, len(shipped.basis)))
+    frames[1] = value
+    found = shipped(frames)
+    np.testing.assert_array_equal(found.probability[1], np.full(KINDS, 1 / KINDS))
+    np.testing.assert_array_equal(found.distance > 1, [False, True])
+    assert found.probability[0].argmax() == LoadKind.NONE
+    assert np.isfinite(found.more).all()
+
+
+def test_a_few_readings_tell_no_kind(proposal):
+    typical = replace(proposal, mean=np.zeros(DIRECTIONS + 1), deviation=np.ones(DIRECTIONS + 1))
+    frame = 1e-4 * np.random.default_rng(6).normal(size=READINGS)
+    frame[MIN_READINGS:] = np.nan
+    enough = typical(frame)
+    assert np.isfinite(enough.distance)
+    frame[0] = np.nan
+    few = typical(frame)
+    assert few.outside
+    assert np.ptp(few.probability) == 0 < np.ptp(enough.probability)
 
 
 def test_a_file_gives_the_same_proposal(proposal, skin, tmp_path):

@@ -28,6 +28,12 @@ SHAPES = {LoadKind.ONE: (1, 4), LoadKind.TWO: (2, 4), LoadKind.EDGE: (1, 6), Loa
 PARAMETERS = sum(rows * size for rows, size in SHAPES.values())
 KINDS = len(LoadKind)
 LAYERS = 3
+# A frame with fewer readings than three loads have parameters cannot tell the kinds of loads from one another.
+MIN_READINGS = max(rows * size for rows, size in SHAPES.values())
+# V; a larger number is no voltage and is missing, as in streams of recordings.
+MAX_READING = 1e18
+# Of the log size above its mean in the training: 30,000 times the usual signal or more.
+MAX_DEVIATIONS = 8.0
 WEIGHTS = tuple(f"{part}{layer}" for layer in range(LAYERS) for part in ("weight", "bias"))
 
 
@@ -49,6 +55,9 @@ class Proposed(NamedTuple):
     | one, two, more: x, y, log width and log force of each load                     | (..., n, 4) | m, N   |
     | edge: those of its middle, and from there to its end                           | (..., 1, 6) | m, N   |
     | distance from the training scenes; beyond 1 lies one in 500 of their own frames | (...)       | 1      |
+
+    The distance is infinite, and all kinds are equally probable, for a frame with fewer readings than `MIN_READINGS`
+    and for one whose signal is larger than any of a real skin.
     """
 
     probability: Float[np.ndarray, "*n 5"]
@@ -130,7 +139,8 @@ class Proposal:
         """Loads in a difference of frames, V, with the forces on the pads, N, where they are known.
 
         Readings and forces that are not finite are missing: electrodes or pads that are dead. A frame with missing
-        readings takes about a millisecond, another one a twentieth of that.
+        readings takes about a millisecond, another one a twentieth of that. A frame with hardly any reading is
+        ``outside``, with even probabilities.
 
         Raises:
             InverseError: if the frame has another number of readings, or the pads another number of forces.
@@ -148,14 +158,19 @@ class Proposal:
 
     def _frames(self, dv: Float[np.ndarray, "n readings"], forces: Float[np.ndarray, "n pads"]) -> Proposed:
         """Loads in some frames."""
-        z, left, count = components(dv / self.noise, self.basis, self.spread)
+        known = np.where(np.abs(dv) <= MAX_READING, dv, np.nan)
+        few = np.isfinite(known).sum(1) < MIN_READINGS
+        known[few] = 0.0
+        z, left, count = components(known / self.noise, self.basis, self.spread)
         seen, size = standardised(z, self.mean, self.deviation)
+        unknown = few | (seen[:, -1] > MAX_DEVIATIONS)
         hidden = np.concatenate([seen, pad_inputs(forces)], -1).astype(np.float32)
         for layer in range(LAYERS):
             hidden = hidden @ getattr(self, f"weight{layer}").T + getattr(self, f"bias{layer}")
             hidden = np.maximum(hidden, 0) if layer < LAYERS - 1 else hidden
         distance = np.max(self.surprise(seen, size, left, count) / self.limits, 1)
-        return self._proposed(hidden.astype(float), distance)
+        found = self._proposed(hidden.astype(float), np.where(unknown, np.inf, distance))
+        return found._replace(probability=np.where(unknown[:, None], 1 / KINDS, found.probability))
 
     def surprise(
         self,
