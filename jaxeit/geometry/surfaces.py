@@ -48,6 +48,10 @@ class AbstractSurface(ABC):
         raise SurfaceError(f"{type(self).__name__} maps to space only; define its method project for the reverse")
 
 
+# Of half a round, by which a sheet that goes once around a cylinder may exceed it.
+ROUNDING = 1e-9
+
+
 def _require_radius(radius: float) -> None:
     if not (is_number(radius) and np.isfinite(radius) and radius > 0):
         raise SurfaceError(f"the surface's radius is {shown(radius)} m; give a length above zero")
@@ -69,6 +73,8 @@ class Plane(AbstractSurface):
 class Cylinder(AbstractSurface):
     """The sheet rolled around an axis along y, unstretched: its readings are those of the flat sheet.
 
+    A sheet that reaches more than half a round to one side of the middle would lie over itself and is refused.
+
     | meaning                                         | shape | unit |
     |-------------------------------------------------|-------|------|
     | radius                                          | ()    | m    |
@@ -84,6 +90,13 @@ class Cylinder(AbstractSurface):
     def __call__(self, chart: np.ndarray) -> np.ndarray:
         x, y = np.asarray(chart).T
         angle = (x - self.middle) / self.radius
+        reach = np.abs(angle).max(initial=0.0)
+        if reach > np.pi * (1 + ROUNDING):
+            raise SurfaceError(
+                f"the sheet reaches {1e3 * reach * self.radius:.4g} mm from x = {self.middle:g} m, the top of a "
+                f"cylinder; half a round is {1e3 * np.pi * self.radius:.4g} mm at radius {self.radius:g} m; give a "
+                "larger radius, and the middle of the sheet as middle"
+            )
         return np.stack([self.radius * np.sin(angle), y, self.radius * np.cos(angle)], 1)
 
     def project(self, points: Float[Points, "*points 3"]) -> Projection:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..budget import require
 from ..geometry.shapes import Disc, Domain, Polygon, Rectangle
-from ..geometry.surfaces import AbstractSurface, Cylinder, Sphere
+from ..geometry.surfaces import AbstractSurface, Cylinder, Sphere, SurfaceError
 from ..kinds import require_kind, stated
 from ..notebook import Drawing, card
 from ..registry import RegistryError
@@ -120,6 +120,7 @@ class Skin:
     Raises:
         ProtocolError: for a protocol of more electrodes.
         SkinError: for a sheet that does not conduct, and for pads beside the sheet, of one name or over one another.
+        SurfaceError: for a sheet that would lie over itself on its surface.
     """
 
     name: str
@@ -140,6 +141,8 @@ class Skin:
             if why := _misfit(pad, self.domain):
                 raise SkinError(f"pad {pad.name!r}: {why}")
         _require_apart(self.pads)
+        if self.surface is not None:
+            self.surface(_rim(self.domain))  # which refuses a sheet that it cannot carry
 
     @property
     def electrode_positions(self) -> np.ndarray:
@@ -153,8 +156,7 @@ class Skin:
         drawing = Drawing(np.array(low), np.array(high))
         for pad in self.pads:
             drawing.polygon(pad.outline, fill=0.08)
-        rim = np.append(self.domain.corners, np.linspace(0, self.domain.perimeter, 129)[:-1])
-        drawing.polygon(self.domain.boundary_point(np.unique(rim)))
+        drawing.polygon(_rim(self.domain))
         drawing.dots(self.electrode_positions, (f"electrode {n}" for n in range(len(self.electrodes))))
         return drawing
 
@@ -171,6 +173,12 @@ class Skin:
         ]
         label = f"Sheet with {len(self.electrodes)} electrodes and {len(self.pads)} pads"
         return card(f"Skin {self.name}", rows, self.drawing.svg(label))
+
+
+def _rim(domain: Domain) -> np.ndarray:
+    """Points around a sheet, with all its corners, (n, 2) m."""
+    along = np.append(domain.corners, np.linspace(0, domain.perimeter, 129)[:-1])
+    return domain.boundary_point(np.unique(along))
 
 
 def shipped_skins() -> tuple[str, ...]:
@@ -255,7 +263,12 @@ def _surface(table: TomlTable, domain: Domain) -> AbstractSurface:
     table.done()
     (x0, y0), (x1, y1) = domain.bounds
     x, y = (x0 + x1) / 2, (y0 + y1) / 2
-    return Cylinder(radius, x) if kind == "cylinder" else Sphere(radius, (x, y))
+    surface = Cylinder(radius, x) if kind == "cylinder" else Sphere(radius, (x, y))
+    try:
+        surface(_rim(domain))
+    except SurfaceError as error:
+        raise table.error("radius", str(error)) from None
+    return surface
 
 
 def _electrodes(table: TomlTable, domain: Domain) -> tuple[AbstractElectrode, ...]:

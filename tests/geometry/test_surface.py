@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
+from jaxeit.toml import TomlError
 
 from ..helpers import skin_of
 
@@ -90,6 +91,31 @@ def test_surfaces_that_cannot_be():
         je.Cylinder(0.0)
     with pytest.raises(ValueError, match="larger radius"):
         je.Sphere(0.01)(np.array([[0.1, 0.0]]))
+
+
+@pytest.mark.parametrize(
+    ("surface", "message"),
+    [
+        (
+            je.Cylinder(0.012, 0.1),
+            r"reaches 100 mm from x = 0.1 m, .* half a round is 37.7 mm at radius 0.012 m; give a larger",
+        ),
+        (je.Cylinder(0.05), "reaches 200 mm from x = 0 m, .* give a larger radius, and the middle of the sheet"),
+        (je.Sphere(0.04, (0.1, 0.1)), "203 degrees around a sphere"),
+    ],
+)
+def test_a_sheet_over_itself_is_refused_when_the_skin_is_made(skin, surface, message):
+    with pytest.raises(je.geometry.SurfaceError, match=message):
+        replace(skin, surface=surface)
+
+
+def test_a_file_of_a_sheet_over_itself_is_refused(chest):
+    with pytest.raises(TomlError, match=r"^mine: \[sheet\]: \[surface\]: radius: the sheet reaches 140 mm from"):
+        je.skin.parse_skin(chest.toml.replace("radius = 0.3 }", "radius = 0.03 }"), "mine")
+
+
+def test_a_sheet_once_around_a_cylinder_is_a_skin(skin):
+    assert replace(skin, surface=je.Cylinder(0.1 / np.pi, 0.1)).surface.radius == 0.1 / np.pi
 
 
 @pytest.mark.parametrize("surface", [je.geometry.Plane(), je.Cylinder(0.3, 0.14), je.Sphere(0.2, (0.1, 0.05))])
