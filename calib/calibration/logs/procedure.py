@@ -40,7 +40,7 @@ from ...session import Session, SessionError, Stream, write_archive
 from ...session.given import call_on, require_session, sessions_of
 from ..fitted_sessions import FITTED, is_fitted, require_each_once
 from ..recipe import Recipe
-from ..recipe_text import AUTO_CURVES
+from ..recipe_text import AUTO_CURVES, SWITCHES
 from .calibration import LogCalibration
 from .evaluation import LogEvaluation, log_evaluation
 from .storage import location_name
@@ -102,10 +102,18 @@ def calibrate_logs(
         evaluation=_second_halves(sessions, series, half, thin),
         provenance=_provenance(sessions, recipe, half, ignored),
         simulated=any(s.simulated for s in sessions),
-        notes=tuple(filter(None, [*ignored, note, placed, thin, missing_direction(whole.model.travel)])),
+        notes=tuple(
+            filter(None, [*ignored, note, placed, thin, missing_direction(whole.model.travel), _of_images(recipe)])
+        ),
         why=half.why,
         tried=half.tried,
     )
+
+
+def _of_images(recipe: Recipe) -> str:
+    """A note of what the recipe asks for and logs do not have; empty: nothing."""
+    asked = [name for name in SWITCHES if getattr(recipe, name)]
+    return f"the recipe's {', '.join(asked)}: for sessions with EIT, left out" if asked else ""
 
 
 def curves_of(recipe: Recipe) -> tuple[AbstractCurve, ...]:

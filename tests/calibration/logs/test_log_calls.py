@@ -1,5 +1,7 @@
 """The functions of `calib` that take any calibration, given that of a log, as the command line is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -30,6 +32,13 @@ def test_the_calibration_of_a_log_is_evaluated_applied_and_moved_as_that_of_a_sk
     np.testing.assert_array_equal(written.arrays["force"], room.apply_log(sensor, session, tmp_path / "again.h5").force)
     moved = calib.recalibrate(sensor, session, room.KnownForces())
     assert moved.shift.gain == room.recalibrate_log(sensor, session).shift.gain
+
+
+def test_what_a_recipe_asks_of_images_is_noted(log):
+    session, sensor = log
+    asked = room.calibrate_logs(session, replace(AFFINE, learn_layer=True, fit_electrodes=True))
+    assert "the recipe's fit_electrodes, learn_layer: for sessions with EIT, left out" in asked.notes
+    assert not any("EIT" in note for note in sensor.notes)
 
 
 def test_what_a_log_has_not_is_named_with_what_to_do(log, tmp_path):
