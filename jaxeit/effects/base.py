@@ -32,6 +32,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from .._compile import is_traced
 from ..registry import limited, require_limits
+from ..registry.limits import LONGEST
 
 
 class StreamKind(enum.Enum):
@@ -143,8 +144,6 @@ Series = Float[Array, "time channels"]
 State: TypeAlias = PyTree[Array]
 
 
-LONGEST = 1.0
-"""Largest length of an effect, m: longer than any skin, and below what a length in mm would be."""
 MOST_STD = 3.0
 """Largest standard deviation of a logarithm: 95 % of what is drawn lie within a factor of 400."""
 

@@ -16,6 +16,7 @@ from .._compile import verb
 from ..linalg.lapack import cho_factor, cho_solve, cholesky, solve_triangular
 from ..model.bases import Picture
 from ..registry import AbstractChoice, Registry, limited
+from ..registry.limits import LONGEST
 
 
 class AbstractPrecision(eqx.Module):
@@ -222,7 +223,7 @@ class GaussianSmooth(AbstractPrior):
     | noser                                                       | False   |      |
     """
 
-    length: float = limited(0.01, above=0)
+    length: float = limited(0.01, above=0, most=LONGEST)
     nugget: float = limited(1e-3, above=0)
     noser: bool = eqx.field(static=True, default=False)
 

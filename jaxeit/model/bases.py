@@ -14,6 +14,7 @@ from .._compile import verb
 from ..budget import require
 from ..linalg.base import on_device
 from ..registry import Registry, limited, require_limits
+from ..registry.limits import LONGEST
 from .discretisation import Model
 from .stiffness import Stiffness, stiffness
 
@@ -209,7 +210,7 @@ class Bumps(AbstractBasis):
 
     columns: int = limited(41, least=2, most=500)
     rows: int | None = limited(None, least=2, most=500, whole=True)
-    width: float = limited(0.012, above=0)
+    width: float = limited(0.012, above=0, most=LONGEST)
 
     def __post_init__(self) -> None:
         require_limits(self, BasisError)

@@ -13,6 +13,10 @@ NO_NUMBERS = "SUOMmc"
 """Kinds of arrays of texts, objects, dates and complex numbers."""
 
 
+LONGEST = 1.0
+"""Largest length among settings, m: longer than any skin, and below what a length in mm would be."""
+
+
 class SettingError(ValueError):
     """A setting outside its limits; the message names the class, the setting and the limits."""
 

@@ -11,6 +11,7 @@ from ..meshing.elements import Space
 from ..meshing.outlines import ArcFootprint
 from ..toml import TomlError, TomlTable
 from .electrodes import AbstractElectrode, ElectrodeError, Pieces, require_contact, require_positive
+from .places import read_contact
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class BoundaryPatch(AbstractElectrode):
         width = table.positive("width", "a length in m")
         first = table.number("first", "arc length of electrode 0's centre in m", 0.0)
         direction = table.choice("direction", "counter-clockwise", "clockwise", default="counter-clockwise")
-        contact = table.number("contact", "the contact impedance in ohm m, zero or more")
+        contact = read_contact(table, "ohm m")
         if count * width > domain.perimeter:
             raise table.error("width", f"{count} electrodes of {width} m do not fit along the edge")
         step = domain.perimeter / count * (1 if direction == "counter-clockwise" else -1)

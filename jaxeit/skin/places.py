@@ -6,6 +6,9 @@ from ..budget import require
 from ..geometry.shapes import Domain
 from ..toml import TomlError, TomlTable
 
+# ohm m^2, or ohm m on the rim: a bolt of 3 mm radius then has 350 megohm, as one that is not connected.
+MAX_CONTACT = 1e4
+
 
 def read_positions(table: TomlTable) -> list[tuple[float, float]]:
     """The places of ``positions`` or of the table ``grid``, m."""
@@ -34,7 +37,15 @@ def read_positions_inside(table: TomlTable, domain: Domain) -> list[tuple[float,
 
 def read_area_contact(table: TomlTable) -> float:
     """The specific contact resistance ``contact``, ohm m^2."""
-    return table.number("contact", "ohm m^2, zero or more")
+    return read_contact(table, "ohm m^2")
+
+
+def read_contact(table: TomlTable, unit: str) -> float:
+    """The contact resistance ``contact``, in a unit of ohm."""
+    contact = table.number("contact", f"{unit}, zero or more")
+    if contact > MAX_CONTACT:
+        raise table.error("contact", f"is {contact:g} {unit}, which conducts nothing; give 0 to {MAX_CONTACT:g} {unit}")
+    return contact
 
 
 def _grid(table: TomlTable) -> np.ndarray:

@@ -72,6 +72,11 @@ def test_no_number_that_is_not_finite_and_no_fraction_of_a_count():
     for value in (math.nan, math.inf, -1.0, 0.0):
         with pytest.raises(SettingError, match=r"GaussianSmooth: length is .*; give more than 0"):
             je.GaussianSmooth(value)
+    for make in (je.GaussianSmooth, je.Greit):
+        with pytest.raises(SettingError, match=r": (length|width) is 20; give more than 0 to 1"):
+            make(20.0)
+    with pytest.raises(je.model.BasisError, match="Bumps: width is 12; give more than 0 to 1"):
+        je.Bumps(width=12.0)
     with pytest.raises(je.model.BasisError, match=r"Pixels: columns is 40\.5; give 1 to 2000, a whole number"):
         je.Pixels(40.5)
     with pytest.raises(SettingError, match="Noser: exponent is 50; give 0 to 1"):

@@ -167,6 +167,12 @@ def test_polygons():
         (RECTANGLES, "[0.15, 0.05]", "[0.195, 0.05]", r"positions: electrode 1 has a corner at \[0.2.* m, outside"),
         (RECTANGLES, "angle = 0.3", "angle = '17 deg'", "angle: is '17 deg'; give the turn counter-clockwise in rad"),
         (RECTANGLES, "contact = 1e-5", "contact = -1.0", "contact: is -1.0; give ohm m.2"),
+        (
+            RECTANGLES,
+            "contact = 1e-5",
+            "contact = 1e6",
+            r"contact: is 1e\+06 ohm m.2, which conducts .* 0 to 10000 ohm",
+        ),
         (RECTANGLES, "angle = 0.3", "angel = 0.3", "angel: unknown key; did you mean 'angle'"),
         (
             POLYGONS,

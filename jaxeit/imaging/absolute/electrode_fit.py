@@ -32,6 +32,7 @@ from ...model.forward_model import coefficients, fields, forward, terminal_matri
 from ...model.motion import Motion, electrode_motion, field_shift_jacobian, moved
 from ...model.sensitivity import field_jacobian, field_slope, scaled_jacobian
 from ...registry import AbstractChoice, limited
+from ...registry.limits import LONGEST
 from ..noise import InverseError, require_real
 from ..priors import GaussianSmooth
 from .background import frame_error, require_frame, sheet_level
@@ -56,12 +57,12 @@ class ElectrodeFitSettings(AbstractChoice):
     | columns: pixels of both fields along x                               | 20      |      |
     """
 
-    shift: float = limited(1e-3, above=0)
+    shift: float = limited(1e-3, above=0, most=LONGEST)
     coat_std: float = limited(0.15, above=0)
-    coat_length: float = limited(0.03, above=0)
+    coat_length: float = limited(0.03, above=0, most=LONGEST)
     gain_std: float = limited(0.12, above=0)
-    gain_length: float = limited(0.015, above=0)
-    width: float = limited(0.012, above=0)
+    gain_length: float = limited(0.015, above=0, most=LONGEST)
+    width: float = limited(0.012, above=0, most=LONGEST)
     model_error: float = limited(3e-3, above=0)
     press_error: float = limited(3e-2, above=0)
     columns: int = limited(20, least=2, static=True)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ...registry import limited
+from ...registry.limits import LONGEST
 from .base import AbstractLinearMethod, Problem
 from .one_step import damped_solution
 
@@ -24,9 +25,9 @@ class Greit(AbstractLinearMethod):
     | edge: over which the disc falls off             | 0.004  | m    |
     """
 
-    width: float = limited(0.012, above=0)
-    radius: float = limited(0.02, above=0)
-    edge: float = limited(0.004, above=0)
+    width: float = limited(0.012, above=0, most=LONGEST)
+    radius: float = limited(0.02, above=0, most=LONGEST)
+    edge: float = limited(0.004, above=0, most=LONGEST)
 
     def image(self, problem: Problem, y: Float[Array, "k ..."]) -> Float[Array, "basis ..."]:
         areas, centres = problem.picture.areas, problem.picture.centres
