@@ -1,11 +1,13 @@
 """The accuracy of a computation; `jaxeit.accuracy` tabulates its cost in time."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from ..kinds import is_number, require_kind, shown, stated
 from ..linalg import AbstractLinearSolver
 from ..meshing.elements import BY_ORDER
 
@@ -46,16 +48,20 @@ class Fidelity:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "dtype", _float(self.dtype))
-        if not 0 < self.edge_length <= 0.25:
-            raise FidelityError(f"edge_length is {self.edge_length}; give 0.001 to 0.25")
-        if self.order not in BY_ORDER:
-            raise FidelityError(f"order is {self.order}; give one of {sorted(BY_ORDER)}")
-        if not 6 <= self.electrode_segments <= 4096:
-            raise FidelityError(f"electrode_segments is {self.electrode_segments}; give 6 to 4096")
-        if not 1.05 <= self.growth <= 2:
-            raise FidelityError(f"growth is {self.growth}; give 1.05 to 2")
-        if not 0 <= self.interpolation <= 0.1:
-            raise FidelityError(f"interpolation is {self.interpolation}; give 0 to 0.1")
+        self._require("edge_length", lambda length: 0 < length <= 0.25, "0.001 to 0.25")
+        self._require("order", lambda order: order in BY_ORDER, f"one of {sorted(BY_ORDER)}")
+        self._require("electrode_segments", lambda sides: 6 <= sides <= 4096, "6 to 4096")
+        self._require("growth", lambda ratio: 1.05 <= ratio <= 2, "1.05 to 2")
+        self._require("interpolation", lambda error: 0 <= error <= 0.1, "0 to 0.1")
+        if self.solver is not None:
+            give = "None, or an object, such as solver=jaxeit.linalg.Dense()"
+            require_kind(self.solver, AbstractLinearSolver, FidelityError, "a linear solver", give, "solver")
+
+    def _require(self, name: str, holds: Callable[[Any], bool], give: str) -> None:
+        """Refuse a field that is no number, or one out of its range."""
+        value = getattr(self, name)
+        if not is_number(value) or not holds(value):
+            raise FidelityError(f"{name} is {shown(value)}; give {give}")
 
     @classmethod
     def draft(cls, **changes: Any) -> "Fidelity":
@@ -74,7 +80,10 @@ class Fidelity:
 
 
 def _float(dtype: Any) -> np.dtype:
-    wanted: np.dtype = np.dtype(dtype)
+    try:
+        wanted: np.dtype = np.dtype(dtype)
+    except TypeError:
+        raise FidelityError(f"dtype is {stated(dtype)}; give float64 or float32") from None
     if wanted not in (np.dtype(np.float32), np.dtype(np.float64)):
         raise FidelityError(f"dtype is {wanted}; give float64 or float32")
     return wanted

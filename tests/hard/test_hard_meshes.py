@@ -204,6 +204,26 @@ def test_settings_of_a_mesh_that_cannot_be_are_refused(wrong, said):
         je.Fidelity(**wrong)
 
 
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"edge_length": "x"}, "edge_length is 'x'; give 0.001 to 0.25"),
+        ({"order": [1]}, r"order is \[1\]; give one of \[1, 2\]"),
+        ({"electrode_segments": "8"}, "electrode_segments is '8'; give 6 to 4096"),
+        ({"growth": None}, "growth is None; give 1.05 to 2"),
+        ({"dtype": "bogus"}, "dtype is 'bogus'; give float64 or float32"),
+        (
+            {"solver": "x"},
+            r"solver: 'x' is not a linear solver; give None, or an object, such as solver=jaxeit.linalg.De",
+        ),
+        ({"solver": je.linalg.Dense}, "solver: the class Dense is not a linear solver"),
+    ],
+)
+def test_settings_of_a_wrong_kind_are_refused_in_one_line(wrong, said):
+    with pytest.raises(je.model.FidelityError, match=f"^{said}"):
+        je.Fidelity.draft(**wrong)
+
+
 @pytest.mark.parametrize("wrong", [{"columns": 0}, {"rows": 2001}])
 def test_pixels_that_cannot_be_are_refused(wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))} is .*; give 1 to 2000, a whole number"):
