@@ -32,7 +32,8 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import DTypeLike
 
 from ._compile import full_precision, is_traced, require_known
-from .kinds import is_number, shown
+from .kinds import is_number, require_kind, shown
+from .linalg.array_libraries import real_array
 from .model.bases import AbstractPictured, overlap_areas
 from .notebook import card, picture
 from .skin.description import Skin
@@ -140,6 +141,9 @@ def pad_masks(skin: Skin, image: AbstractPictured) -> PadMasks:
         FusionError: if the image is not one of pixels or is that of another sheet, or a pad lies outside it.
     """
     require_known("pad_masks", FusionError, image)
+    require_kind(skin, Skin, FusionError, "a skin", "one, such as jaxeit.load_skin('testbed')", "pad_masks")
+    image_of = "a reconstructor, or a basis on a model, such as jaxeit.Pixels(20).on(model)"
+    require_kind(image, AbstractPictured, FusionError, "an image", image_of, "pad_masks")
     if len(image.shape) != 2:
         raise FusionError("pad masks need an image of pixels; prepare with basis=Pixels(...)")
     x0, x1, y0, y1 = image.extent
@@ -271,17 +275,24 @@ def fuse(
         pad_errors: standard errors of the pads' forces, (..., pads) N, for the standard errors of the map.
 
     Raises:
-        FusionError: if the shapes do not fit, or the gate is no number from 0 to 1.
+        FusionError: if the shapes do not fit, numbers are not real, the gate is no number from 0 to 1, or the masks or
+            contacts are none.
     """
     require_gate(gate)
+    require_kind(masks, PadMasks, FusionError, "masks of pads", "those of jaxeit.pad_masks(skin, recon)", "fuse")
+    if contacts is not None:
+        give = "shares of jaxeit.fusion.contact_shares"
+        require_kind(contacts, ContactShares, FusionError, "shares of contacts", give, "fuse")
     # numbers of Python, of lists too, would be constants of the program: another value would compile it anew
-    image, forces = jnp.asarray(image), jnp.asarray(pad_forces)
+    image, forces = real_array("image", image, FusionError), real_array("pad_forces", pad_forces, FusionError)
     pads, pixels = masks.weights.shape
     if image.shape[-1:] != (pixels,) or forces.shape[-1:] != (pads,):
         raise FusionError(
             f"image {image.shape} and pad_forces {forces.shape} must end in {pixels} pixels and {pads} pads"
         )
-    errors = None if pad_errors is None else jnp.asarray(pad_errors)
+    errors = None if pad_errors is None else real_array("pad_errors", pad_errors, FusionError)
+    if errors is not None and errors.shape[-1:] != (pads,):
+        raise FusionError(f"pad_errors has shape {errors.shape}; give a standard error, N, of each of {pads} pads")
     return _fused(image, masks, forces, jnp.asarray(gate, masks.areas.dtype), contacts, errors)
 
 

@@ -121,6 +121,39 @@ def test_shapes_that_do_not_fit_are_refused(skin, model, pixels, masks):
         je.pad_masks(skin, je.Elements().on(model))
 
 
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (
+            {"pad_forces": np.array([1 + 1j, 2, 3, 4])},
+            "pad_forces is complex; give real numbers, such as pad_forces.real",
+        ),
+        ({"pad_forces": "abcd"}, "pad_forces is 'abcd'; give an array of real numbers"),
+        ({"pad_errors": np.full(4, 1j)}, "pad_errors is complex"),
+        ({"pad_errors": np.ones(3)}, r"pad_errors has shape \(3,\); give a standard error, N, of each of 4 pads"),
+        ({"image": np.full(400, 1j)}, "image is complex"),
+        (
+            {"masks": np.ones((4, 400))},
+            r"fuse: ndarray is not masks of pads; give those of jaxeit.pad_masks\(skin, recon",
+        ),
+        ({"contacts": "two"}, "fuse: 'two' is not shares of contacts; give shares of jaxeit.fusion.contact_shares"),
+    ],
+)
+def test_what_is_no_image_force_or_mask_is_refused(pixels, masks, wrong, message):
+    given = {"image": jnp.zeros(pixels.size), "masks": masks, "pad_forces": jnp.zeros(4)} | wrong
+    with pytest.raises(je.fusion.FusionError, match=message):
+        je.fuse(**given)
+
+
+def test_masks_are_of_a_skin_and_an_image(skin, model, pixels):
+    with pytest.raises(je.fusion.FusionError, match=r"pad_masks: Model is not a skin; give one, such as"):
+        je.pad_masks(model, pixels)
+    with pytest.raises(
+        je.fusion.FusionError, match=r"pad_masks: Skin is not an image; give a reconstructor, or a basis"
+    ):
+        je.pad_masks(skin, skin)
+
+
 def test_the_image_of_another_sheet_is_refused(skin, pixels):
     wide = replace(skin, name="wide", domain=je.Rectangle(0.3, 0.2), pads=())
     said = r"the image spans \(0, 0\) to \(0.2, 0.2\) m, but the sheet of 'wide' \(0, 0\) to \(0.3, 0.2\) m; give an"

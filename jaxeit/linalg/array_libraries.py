@@ -10,6 +10,7 @@ import scipy.linalg
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from ..kinds import stated
 from . import lapack
 
 
@@ -61,3 +62,18 @@ NUMPY = ArrayLibrary(
     solve_lower=_numpy_solve_lower,
     add_at=_numpy_add_at,
 )
+
+
+def real_array(name: str, values: Any, error: type[Exception]) -> Array:
+    """Values as an array of JAX, also where jit, grad or vmap hides them.
+
+    Raises:
+        error: unless they are real numbers; ``name`` names them.
+    """
+    try:
+        found = jnp.asarray(values)
+    except (TypeError, ValueError):
+        raise error(f"{name} is {stated(values)}; give an array of real numbers") from None
+    if jnp.iscomplexobj(found):
+        raise error(f"{name} is complex; give real numbers, such as {name}.real")
+    return found

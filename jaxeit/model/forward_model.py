@@ -35,6 +35,7 @@ from ..effects import (
     fold,
 )
 from ..linalg import AbstractPlan, inverse_columns
+from ..linalg.array_libraries import real_array
 from ..linalg.small_matrices import summed
 from .discretisation import Model, require_model
 from .metal_sheet import CoatCoefficients, CoatFields, assemble_coat, coat_energy, coat_fields
@@ -103,7 +104,7 @@ def forward(
     """
     require_model(model)
     sigma = conductivity(model) if sigma is None else sigma  # one program, with or without a conductivity given
-    return _forward(model, sigma if isinstance(sigma, CoatedSheet) else jnp.asarray(sigma))
+    return _forward(model, sigma if isinstance(sigma, CoatedSheet) else real_array("sigma", sigma, ValueError))
 
 
 @verb
