@@ -110,6 +110,8 @@ def sheet_and_readings(
     """
     require_model(model)
     require_known(name, InverseError, model, noise, untouched, sigma, channels)
+    if noise is None:
+        raise InverseError(f"{name}: noise is None; give the standard deviation of each reading, V")
     return sheet_of(model, untouched, sigma, channels), whitened_readings(model, noise, channels)
 
 

@@ -28,9 +28,11 @@ from scipy.linalg.lapack import dpstrf
 from .._compile import is_traced, require_known
 from ..budget import require
 from ..effects import AbstractTerminalEffect, CommonMode, chosen
+from ..kinds import stated
 from ..linalg.array_libraries import JAX, NUMPY, ArrayLibrary
 from ..model.discretisation import Model
 from ..model.mixing import Mixing, matrix_of_rows, padded_rows
+from ..registry.limits import NO_NUMBERS
 
 
 class InverseError(ValueError):
@@ -317,10 +319,30 @@ def require_frames(dv: Float[ArrayLike, "..."], readings: int) -> None:
 
 
 def require_real(**frames: Any) -> None:
-    """Refuse complex frames: a conversion to float would leave out the imaginary part without an error."""
+    """Refuse frames of texts, and complex ones: a conversion to float would leave out the imaginary part silently."""
     for name, frame in frames.items():
-        if jnp.iscomplexobj(frame):
+        known = frame if is_traced(frame) or hasattr(frame, "dtype") else _array_of(frame)
+        if jnp.iscomplexobj(known):
             raise InverseError(f"{name} is complex, and a model is real; give {name}.real, or {name}.imag by itself")
+        if not is_traced(frame) and known.dtype.kind in NO_NUMBERS:
+            raise InverseError(f"{name} is {stated(frame)}; give real numbers, V")
+
+
+def real_numbers(name: str, values: Any, unit: str) -> np.ndarray:
+    """Values that are known, as an array of float64; refused unless they are real numbers."""
+    found = _array_of(values)
+    if found.dtype.kind in NO_NUMBERS:
+        kind = "complex" if found.dtype.kind == "c" else stated(values)
+        raise InverseError(f"{name} is {kind}; give real numbers, {unit}")
+    return found.astype(float, copy=False)
+
+
+def _array_of(values: Any) -> np.ndarray:
+    """Known values as an array; one of objects where their rows have unequal lengths."""
+    try:
+        return np.asarray(values)
+    except ValueError:
+        return np.array(None)
 
 
 def require_some(used: Any) -> Any:
@@ -343,7 +365,7 @@ def noise_weight(noise: Any, readings: int, channels: np.ndarray) -> Any:
             "MeasuredNoise() to je.Imaging(noise=...), whose prepare(model, quiet=frames) measures it"
         )
     library, known = (JAX, False) if is_traced(noise) else (NUMPY, True)
-    noise = jnp.asarray(noise) if not known else np.asarray(noise, float)
+    noise = jnp.asarray(noise) if not known else real_numbers("noise", noise, "V")
     if noise.shape not in ((readings,), (readings, readings)):
         raise InverseError(
             f"noise has shape {noise.shape}; this model has {readings} readings: give the standard deviation of each, "
@@ -406,7 +428,7 @@ def noise_covariance(blank: Float[ArrayLike, "frames readings"]) -> np.ndarray:
         crosstalk = je.prepare(model, basis=je.Pixels(10), noise=je.imaging.noise_covariance(quiet))
     """
     require_known("noise_covariance", InverseError, blank)
-    blank = np.asarray(blank, float)
+    blank = real_numbers("the blank recording", blank, "V")
     if blank.ndim != 2 or len(blank) < 4 or not np.isfinite(blank).all():
         raise InverseError(f"the blank recording has shape {blank.shape}; give four or more frames of finite readings")
     n, centred = len(blank), blank - blank.mean(0)

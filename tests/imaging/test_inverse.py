@@ -61,6 +61,16 @@ def test_a_touch_is_found_where_it_is(model, recon):
     assert float(je.metrics.image_sum(image, recon.areas)) > 0
 
 
+@pytest.mark.parametrize("frame", ["x", ["a"] * 550, np.full(550, "1.0")])
+def test_a_frame_of_texts_is_refused_in_one_line(model, frame):
+    frames = [je.imaging.fit_background, je.imaging.fit_reference, je.imaging.absolute_image]
+    for call in (*frames, je.imaging.find_misplacement):
+        with pytest.raises(je.imaging.InverseError, match=r"^(v0|frame) is .*; give real numbers, V$"):
+            call(model, frame)
+    with pytest.raises(je.imaging.InverseError, match=r"^noise is 'x'; give real numbers, V$"):
+        je.imaging.find_misplacement(model, je.forward(model), noise="x")
+
+
 def test_complex_frames_are_refused(recon, model):
     """JAX would leave out their imaginary part with a warning."""
     frame = np.ones(550) + 1j

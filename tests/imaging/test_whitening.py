@@ -163,6 +163,25 @@ def test_gradients_pass_a_frame_with_gaps(noisy):
 
 
 @pytest.mark.parametrize(
+    ("noise", "said"),
+    [
+        ("x", "noise is 'x'; give real numbers, V"),
+        (["a"] * 550, "noise is list; give real numbers, V"),
+        ([[1.0, 2.0], [3.0]], "noise is list; give real numbers, V"),
+        (np.full(550, 1e-5 + 1e-6j), "noise is complex; give real numbers, V"),
+    ],
+)
+def test_noise_that_is_no_number_is_refused_in_one_line(model, pixels, noise, said):
+    for call in (lambda: je.prepare(model, basis=pixels, noise=noise), lambda: je.prepare_contacts(model, noise=noise)):
+        with pytest.raises(je.imaging.InverseError, match=f"^{said}$"):
+            call()
+    with pytest.raises(je.imaging.InverseError, match=r"^the blank recording is complex; give real numbers, V$"):
+        je.imaging.noise_covariance(np.ones((5, 3)) * 1j)
+    with pytest.raises(je.imaging.InverseError, match=r"^prepare_contacts: noise is None; give the standard deviation"):
+        je.prepare_contacts(model, noise=None)
+
+
+@pytest.mark.parametrize(
     ("noise", "message"),
     [
         (np.ones((550, 550)), "positive definite"),

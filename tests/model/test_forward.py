@@ -19,6 +19,14 @@ from ..oracles.rectangle import four_point
 POINTS = [(0.06, 0.06), (0.14, 0.10), (0.10, 0.14), (0.06, 0.13)]
 
 
+@pytest.mark.parametrize("sigma", ["x", object(), [[1.0], [1.0, 2.0]]])
+def test_what_is_no_conductivity_is_refused(model, sigma):
+    with pytest.raises(ValueError, match=r"^sigma is .*; give an array of real numbers$"):
+        je.forward(model, sigma)
+    with pytest.raises(ValueError, match=r"^sigma is .*; give the conductivity of each element, S, as an array$"):
+        je.prepare(model, basis=je.Pixels(4), sigma=sigma)
+
+
 def test_rectangle_oracle_has_the_published_value():
     exact = four_point(0.2, 0.2, (0.06, 0.06), (0.14, 0.10), (0.10, 0.142), (0.062, 0.13))
     assert exact == pytest.approx(-0.1409373898, abs=1e-10)

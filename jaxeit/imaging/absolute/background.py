@@ -13,9 +13,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from ..._compile import verb
+from ...kinds import stated
 from ...model.bases import BasisMap, Pixels
 from ...model.discretisation import Model
-from ...model.forward_model import forward
+from ...model.forward_model import CoatedSheet, forward
 from ..noise import InverseError, require_real
 from ..priors import AbstractPrecision, GaussianSmooth
 from .images import ImagePosterior, LogConductivity, Quadratic, most_probable, reading_weights
@@ -154,6 +155,8 @@ def sheet_of(
     Raises:
         InverseError: if both a frame and a conductivity are given, or no coating explains the frame.
     """
+    if sigma is not None and not hasattr(sigma, "shape") and not isinstance(sigma, CoatedSheet):
+        raise InverseError(f"sigma is {stated(sigma)}; give the conductivity of each element, S, as an array")
     frame = untouched_frame(model, untouched, sigma, channels)
     return sigma if frame is None else fit_background(model, frame)
 

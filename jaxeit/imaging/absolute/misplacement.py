@@ -28,7 +28,7 @@ from ...model.discretisation import Model
 from ...model.forward_model import coefficients, fields, terminal_matrix, voltages
 from ...model.motion import Motion, electrode_motion, field_shift_jacobian
 from ...model.sensitivity import field_jacobian
-from ..noise import InverseError
+from ..noise import InverseError, real_numbers, require_real
 from .background import coat_precision, even_coat, frame_error
 from .images import LogConductivity, Quadratic, gauss_newton
 
@@ -85,13 +85,14 @@ def find_misplacement(
         print(f"bolts sit {1e3 * doubt.size:.1f} mm aside; log evidence {0.5 * doubt.evidence:.0f}")
     """
     require_known("find_misplacement", InverseError, model.nodes, v0, noise)
+    require_real(v0=v0)
     frame = jnp.asarray(v0, model.dtype)
     physics = even_coat(model, frame, Pixels(COAT_COLUMNS).on(model))
     penalty = Quadratic(coat_precision(physics.image, COAT_LENGTH), 1 / jnp.asarray(USUAL_COAT) ** 2)
     coat = gauss_newton(physics, penalty, frame, frame_error(frame, COAT_ERROR))
     linear = _linear(physics, electrode_motion(model), coat)
     error = np.asarray(frame_error(frame, MODEL_ERROR), float)
-    spread = np.zeros_like(error) if noise is None else np.asarray(noise, float)
+    spread = np.zeros_like(error) if noise is None else real_numbers("noise", noise, "V")
     if spread.shape != error.shape or not (spread >= 0).all():
         raise InverseError("noise is not one number of zero or more for each reading of v0; give volts")
     known = np.isfinite(np.asarray(frame))
