@@ -34,7 +34,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer, Real, Shaped
 
 from ._compile import full_precision, is_traced, verb
-from .kinds import stated
+from .kinds import shown, stated
+from .linalg.array_libraries import real_array
 from .registry import AbstractChoice, limited
 
 __all__ = [
@@ -134,7 +135,7 @@ def _on_pixels(image: Float[ArrayLike, "... pixels"], recon: Pictured) -> Float[
     """The image, (..., pixels); MetricError unless it is one of the pixels of ``recon``."""
     if not hasattr(recon, "centres"):
         raise MetricError(f"{stated(recon)} has no pixels; give a reconstructor, or Pixels(20).on(model)")
-    image, pixels = jnp.asarray(image), len(recon.centres)
+    image, pixels = real_array("image", image, MetricError), len(recon.centres)
     if image.shape[-1:] != (pixels,):
         raise MetricError(f"image of shape {image.shape}; give (..., {pixels}), one number for each pixel of recon")
     return image
@@ -183,7 +184,7 @@ def localisation_error(estimated: Places, true: Places) -> Float[Array, "..."]:
     Raises:
         MetricError: if the positions are not pairs, or as many of them as fit each other.
     """
-    found, wanted = jnp.asarray(estimated), jnp.asarray(true)
+    found, wanted = (real_array("positions", each, MetricError) for each in (estimated, true))
     try:
         np.broadcast_shapes(found.shape, wanted.shape)
         pairs = found.shape[-1:] == wanted.shape[-1:] == (2,)
@@ -236,7 +237,12 @@ def coefficient_of_variation(values: Float[ArrayLike, "... n"], *, ddof: int) ->
         sums = je.metrics.image_sum(images, recon.areas)  # S m^2
         print(je.metrics.coefficient_of_variation(sums, ddof=1))  # of equal touches at several places
     """
-    found: Array = _variation(jnp.asarray(values), ddof)
+    numbers = real_array("values", values, MetricError)
+    if ddof not in (0, 1) or not numbers.shape[-1:] > (0,):
+        raise MetricError(
+            f"values of shape {numbers.shape} with ddof={shown(ddof)}; give (..., n) values, and 0 or 1 for ddof"
+        )
+    found: Array = _variation(numbers, ddof)
     return found
 
 
@@ -303,9 +309,9 @@ def greit_figures(
 
     Source: Adler et al. 2009, Physiol. Meas. 30 S35, section 2.2.
     """
-    dtype = recon.areas.dtype
+    image, dtype = _on_pixels(image, recon), recon.areas.dtype
     where = jnp.asarray(target, dtype), jnp.asarray(centre, dtype)
-    return _greit_figures(jnp.asarray(image), recon.centres, recon.areas, *where)
+    return _greit_figures(image, recon.centres, recon.areas, *where)
 
 
 @verb
@@ -344,7 +350,12 @@ def image_correlation(
 
     0 where either image is constant, so that a mean over many frames stays finite. Pixels without area are ignored.
     """
-    return _image_correlation(jnp.asarray(image), jnp.asarray(truth), jnp.asarray(areas))
+    given = {"image": image, "truth": truth, "areas": areas}
+    pictures = [real_array(name, values, MetricError) for name, values in given.items()]
+    if len({picture.shape[-1:] for picture in pictures}) > 1 or not pictures[2].ndim:
+        shapes = ", ".join(f"{name} {picture.shape}" for name, picture in zip(given, pictures, strict=True))
+        raise MetricError(f"shapes that do not fit: {shapes}; give one number for each pixel")
+    return _image_correlation(*pictures)
 
 
 @verb
@@ -452,7 +463,7 @@ def ktc_score(
 def _pictures(
     image: Real[ArrayLike, "..."], truth: Real[ArrayLike, "..."]
 ) -> tuple[Float[Array, "... rows columns"], Float[Array, "... rows columns"]]:
-    image, truth = jnp.asarray(image), jnp.asarray(truth)
+    image, truth = real_array("image", image, MetricError), real_array("truth", truth, MetricError)
     if image.shape != truth.shape or image.ndim < 2 or not image.size:
         raise MetricError(
             f"pictures of shapes {image.shape} and {truth.shape}; give two of one shape (..., rows, columns)"
@@ -504,8 +515,8 @@ def otsu_thresholds(
         shape = recon.shape
         print(je.metrics.ktc_score(pressed.reshape(shape), truth.astype(int).reshape(shape)))  # 1 is best
     """
-    values = jnp.asarray(values)
-    weights = jnp.ones(values.shape) if weights is None else jnp.asarray(weights)
+    values = real_array("values", values, MetricError)
+    weights = jnp.ones(values.shape) if weights is None else real_array("weights", weights, MetricError)
     if not 2 <= classes <= bins:
         raise MetricError(f"{classes} classes from {bins} bins; give at least 2 classes, and no more classes than bins")
     if weights.shape != values.shape or not values.size:

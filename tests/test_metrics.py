@@ -440,6 +440,30 @@ def test_an_image_of_other_pixels_is_refused(estimator):
         estimator(np.ones((2, 4)), je.Pixels(2))
 
 
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda m, grid: m.Peak()(np.ones(9) * 1j, grid), "image is complex; give real numbers, such as image.real"),
+        (lambda m, grid: m.LevelCentroid()("x", grid), "image is 'x'; give an array of real numbers"),
+        (lambda m, grid: m.localisation_error([1j, 2], [1, 2]), "positions is complex"),
+        (lambda m, grid: m.greit_figures(np.ones(5), grid, (0, 0), (0, 0)), r"image of shape \(5,\); give \(..., 9\)"),
+        (lambda m, grid: m.greit_figures(np.ones(9), 3, (0, 0), (0, 0)), "int has no pixels; give a reconstructor"),
+        (lambda m, grid: m.image_correlation(np.ones(9) * 1j, np.ones(9), grid.areas), "image is complex"),
+        (
+            lambda m, grid: m.image_correlation(np.ones(9), np.ones(5), grid.areas),
+            r"truth \(5,\), areas \(9,\); give one",
+        ),
+        (lambda m, grid: m.structural_similarity(np.eye(4) * 1j, np.eye(4)), "image is complex"),
+        (lambda m, grid: m.otsu_thresholds(np.ones(9) * 1j), "values is complex"),
+        (lambda m, grid: m.coefficient_of_variation(np.ones(0), ddof=1), r"shape \(0,\) with ddof=1; give \(..., n\)"),
+        (lambda m, grid: m.coefficient_of_variation(np.ones(5), ddof="x"), "ddof='x'; .* and 0 or 1 for ddof"),
+    ],
+)
+def test_what_is_no_image_or_position_is_refused_in_one_line(call, said):
+    with pytest.raises(MetricError, match=said):
+        call(je.metrics, Grid(np.zeros((9, 2)), np.ones(9)))
+
+
 @pytest.mark.parametrize("shapes", [((3, 2), (4, 2)), ((3,), (3,)), ((), (2,)), ((5, 3), (5, 2))])
 def test_positions_that_do_not_fit_each_other_are_refused(shapes):
     with pytest.raises(MetricError, match=r"positions of shapes .*; give \(..., 2\) m, as many true as estimated ones"):

@@ -16,6 +16,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Integer
 
 from .._compile import full_precision, is_traced, require_known
+from ..kinds import is_number, require_kind, shown
+from ..linalg.array_libraries import real_array
 from ..skin.protocol import Protocol, ProtocolError
 
 # A gain below this part of the largest one is rounding error: the readings taken before span the range of K.
@@ -106,9 +108,12 @@ def choose_readings(
     Raises:
         ProtocolError: if the scan has fewer readings, or (for `Volume`) K has a lower rank.
     """
-    readings, selection = signal.shape[0], selection or DOptimal()
-    if not 0 < count <= readings:
-        raise ProtocolError(f"count is {count}, and this scan has {readings} readings; give 1 to {readings}")
+    signal, selection = real_array("signal", signal, ProtocolError), selection or DOptimal()
+    readings = _readings_of(signal)
+    give = "an object, such as selection=jaxeit.scan.DOptimal()"
+    require_kind(selection, AbstractSelection, ProtocolError, "a selection", give, "choose_readings")
+    if not is_number(count) or not 0 < count <= readings:
+        raise ProtocolError(f"count is {shown(count)}, and this scan has {readings} readings; give 1 to {readings}")
     if pattern is None and (is_traced(switch) or switch):
         raise ProtocolError("switch is given without the pattern that names the driven pairs; give pattern=")
     drive = np.zeros(readings, int) if pattern is None else drives(pattern)
@@ -118,6 +123,15 @@ def choose_readings(
             f"the readings span fewer than {count} dimensions; ask for fewer readings, or choose by DOptimal"
         )
     return chosen
+
+
+def _readings_of(signal: Float[Array, "readings readings"]) -> int:
+    """The number of readings of K, which is refused unless it is square and, where it can be seen, finite."""
+    if signal.ndim != 2 or signal.shape[0] != signal.shape[1]:
+        raise ProtocolError(f"signal has shape {signal.shape}; give (readings, readings), from signal_covariance")
+    if not is_traced(signal) and not np.isfinite(np.asarray(signal)).all():
+        raise ProtocolError("signal has entries that are not finite; give that of signal_covariance for a sound model")
+    return signal.shape[0]
 
 
 def _spans_less(chosen: Chosen) -> bool:

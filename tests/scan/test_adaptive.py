@@ -238,3 +238,19 @@ def test_an_event_scan_needs_pads(model, skin):
     bare = je.Skin("bare", skin.domain, skin.sheet_resistance, skin.electrodes, skin.protocol)
     with pytest.raises(je.skin.ProtocolError, match="has no pads"):
         je.scan.prepare_event_scan(model, bare, je.scan.EventScanSettings(onset=1.0))
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (("x", 2), "signal is 'x'; give an array of real numbers"),
+        ((np.eye(6) * 1j, 2), "signal is complex"),
+        ((np.ones((6, 5)), 2), r"signal has shape \(6, 5\); give \(readings, readings\), from signal_covariance"),
+        ((np.full((6, 6), np.nan), 2), "signal has entries that are not finite"),
+        ((np.eye(6), "2"), "count is '2', and this scan has 6 readings"),
+        ((np.eye(6), 2, "x"), "choose_readings: 'x' is not a selection; give an object, such as"),
+    ],
+)
+def test_what_is_no_signal_is_refused(given, said):
+    with pytest.raises(je.skin.ProtocolError, match=said):
+        je.scan.choose_readings(*given)
