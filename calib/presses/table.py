@@ -6,11 +6,20 @@ from dataclasses import dataclass, field
 import numpy as np
 
 import jaxeit as je
+from jaxeit.kinds import require_kind
 
 from ..session import PressTable, Session, SessionError, Stream
 from ..session.mixing import same_scan
 from ..session.units import SECOND
-from .corrections import AbstractBaseline, AbstractCorrection, LowPass, TwoSided, WindowMeans, sample_rate
+from .corrections import (
+    AbstractBaseline,
+    AbstractCorrection,
+    CorrectionError,
+    LowPass,
+    TwoSided,
+    WindowMeans,
+    sample_rate,
+)
 from .detection import find_presses
 from .means import PressMeans, hold_positions, press_means
 from .samples import PressSamples, press_samples
@@ -31,11 +40,25 @@ class Processing:
     |             | sampled fast enough, and a note for the others                             |                 |
     | baseline    | rule for what is subtracted from a press                                   | `TwoSided`      |
     | windows     | lengths of the windows                                                     | `WindowLengths` |
+
+    Raises:
+        CorrectionError: for another object in the place of one of these.
     """
 
     corrections: tuple[AbstractCorrection, ...] | None = None
     baseline: AbstractBaseline = field(default_factory=TwoSided)
     windows: WindowLengths = field(default_factory=WindowLengths)
+
+    def __post_init__(self) -> None:
+        if self.corrections is not None:
+            give = "a tuple of corrections, such as (calib.presses.LowPass(50.0),)"
+            require_kind(self.corrections, tuple, CorrectionError, "a tuple", give, "corrections")
+            for one in self.corrections:
+                require_kind(one, AbstractCorrection, CorrectionError, "a correction", give, "corrections")
+        give = "one, such as calib.presses.TwoSided()"
+        require_kind(self.baseline, AbstractBaseline, CorrectionError, "a baseline", give, "baseline")
+        give = "calib.presses.WindowLengths()"
+        require_kind(self.windows, WindowLengths, CorrectionError, "lengths of windows", give, "windows")
 
     def of(self, stream: Stream) -> tuple[AbstractCorrection, ...]:
         """Corrections for one stream."""

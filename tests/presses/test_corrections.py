@@ -14,6 +14,7 @@ from calib.presses.corrections import (
     correct,
     window_means,
 )
+from calib.presses.table import Processing
 
 RATE = 182.0
 
@@ -133,3 +134,17 @@ def test_standard_error_of_a_window_is_honest_for_white_and_filtered_noise(smoot
     pulls = out.mean[0] / out.standard_error[0]
     # Student's t with 7 degrees of freedom has variance 7/5
     assert np.var(pulls) == pytest.approx(7 / 5, rel=0.25)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"corrections": 50.0}, r"corrections: float is not a tuple; give a tuple of corrections, such as \(calib"),
+        ({"corrections": (50.0,)}, "corrections: float is not a correction"),
+        ({"baseline": "pre"}, "baseline: 'pre' is not a baseline; give one, such as calib.presses.TwoSided"),
+        ({"windows": 1.0}, r"windows: float is not lengths of windows; give calib.presses.WindowLengths\(\)"),
+    ],
+)
+def test_how_presses_are_processed_is_told_by_objects(wrong, said):
+    with pytest.raises(CorrectionError, match=said):
+        Processing(**wrong)
