@@ -372,6 +372,36 @@ def test_a_converter_at_its_end_is_saturated(count, severity, parts, look):
     assert 0.5 * count <= report.channels.saturated.sum() + report.channels.dead.sum() <= count
 
 
+def same_readings(parts, header):
+    """No noise, four readings of one value, the largest of all: as of a symmetric skin that is simulated."""
+    parts.header = header
+    time = parts.streams["eit"][3]
+    frame = parts.values("eit").mean(0)
+    frame[np.argsort(np.abs(frame))[-4:]] = -2 * np.abs(frame).max()
+    parts.change("eit", frame * (1 + np.outer(loads(time) @ [2e-3, 1e-3], np.linspace(0, 1, len(frame)))))
+    return frame
+
+
+SIMULATED = {"simulated": True, "scene": "[scene]", "seed": 1}
+
+
+@pytest.mark.parametrize("header", [{}, SIMULATED], ids=["recorded", "simulated"])
+def test_equal_readings_without_noise_are_not_saturated(header, parts, look):
+    same_readings(parts, header)
+    report = look(parts)
+    assert not report.channels.saturated.any()
+    assert not any("saturated" in f.what for f in report.findings)
+
+
+def test_readings_that_never_change_do_not_rise(parts, look):
+    frame = same_readings(parts, SIMULATED)
+    parts.change("eit", np.tile(frame, (len(parts.values("eit")), 1)))
+    report = look(parts)
+    has(report, Severity.ERROR, "550 of 550 readings never change (dead)")
+    assert {name for name, _ in report.onsets} == {"pressure"}
+    assert "eit rises" not in render(report)
+
+
 def test_the_status_flag_tells_which_reading_is_saturated(parts, look):
     eit = parts.values("eit")
     top = eit.max(0).argmax()

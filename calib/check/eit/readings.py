@@ -145,7 +145,8 @@ def _channel_table(stats: StreamStatistics, session: Session, presses: PressColu
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = 20 * np.log10(np.abs(mean) / noise)
     partner = je.skin.reciprocal_rows(pattern) if mixing is None else np.full(len(mean), -1)
-    saturated = _saturated(stats)
+    # Readings of a symmetric skin share values where there is no noise, far from the converter's end.
+    saturated = _saturated(stats, by_shared=not session.simulated and bool((noise > 0).any()))
     typical = np.median(noise[np.isfinite(noise)]) if np.isfinite(noise).any() else np.inf
     return ChannelTable(
         frames=len(values),
@@ -170,18 +171,18 @@ def _reciprocity(mean: np.ndarray, partner: np.ndarray) -> np.ndarray:
     return np.asarray(np.abs(mean - other) / np.where(size > 0, size, np.nan))
 
 
-def _saturated(stats: StreamStatistics) -> np.ndarray:
+def _saturated(stats: StreamStatistics, by_shared: bool) -> np.ndarray:
     """Channels that reach an end of the converter: an extreme value of all channels that several of them share.
 
     A single channel may rest at its own extreme; it counts only if the status flag says that some reading is
-    saturated. A channel that is always zero is dead.
+    saturated, as all do unless ``by_shared``. A channel that is always zero is dead.
     """
     some = (stats.finite > 0) & ~((stats.low == 0) & (stats.high == 0))
     out = np.zeros(len(some), bool)
     for value, count in ((stats.low, stats.at_low), (-stats.high, stats.at_high)):
         if some.any():
             at_end = some & (value == value[some].min()) & (count > SATURATED_FRACTION * len(stats.time))
-            if at_end.sum() >= MIN_SHARED_EXTREMES or stats.flagged(Status.saturated):
+            if (by_shared and at_end.sum() >= MIN_SHARED_EXTREMES) or stats.flagged(Status.saturated):
                 out |= at_end
     return out
 

@@ -37,7 +37,8 @@ def compare_clocks(
     if force is None or evidence.force is None or force.dead.all():
         return ()
     presses, windows = evidence.compared()
-    streams = {name: statistics[name].stream for name in COMPARED if name in statistics}
+    moving = [name for name in COMPARED if name in statistics and not statistics[name].dead.all()]
+    streams = {name: statistics[name].stream for name in moving}
     onsets = onset_delays(force.stream, streams.values(), presses, windows)
     ramp = float(np.median(presses.t_hold0 - presses.t_press)) / SECOND
     for name, onset in onsets.items():
