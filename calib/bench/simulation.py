@@ -17,6 +17,7 @@ from jaxeit.kinds import require_kind
 
 from ..session import PressTable, SessionFacts, SessionWriter, Status, StreamFacts
 from ..session.given import call_on
+from ..session.hdf5.storage import disk_full_named
 from .bench import Bench, BenchError
 from .motion import Motion
 from .streams import AbstractSimulatedStream, SampleBlock, SimulatedStreams, simulated_streams
@@ -57,10 +58,11 @@ def simulate(
     made = simulated_streams(bench, fidelity)
     part = path.with_name(path.name + ".part")
     _require_space(made, part)
-    store = _BlockStore(part, _fingerprint(bench, fidelity))
-    for name, number, recording in progress(_BlockSequence(made)):
-        store.make(name, number, recording)
-    _write(made, store, path)
+    with disk_full_named(path):
+        store = _BlockStore(part, _fingerprint(bench, fidelity))
+        for name, number, recording in progress(_BlockSequence(made)):
+            store.make(name, number, recording)
+        _write(made, store, path)
     store.remove()
     return path
 

@@ -1,5 +1,6 @@
 """Session and result files: what is written comes back, and what is not sound is refused."""
 
+import errno
 import io
 import os
 import pickle
@@ -10,6 +11,7 @@ import zlib
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import h5netcdf
 import h5py
@@ -34,9 +36,11 @@ from calib.session import (
     open_archive,
     open_session,
     read_archive,
+    replacing,
     write_archive,
 )
 from calib.session.hdf5.chunks import checksum_holds
+from calib.session.hdf5.storage import folder_beside
 
 EPOCH = datetime(2025, 1, 1, 12, tzinfo=UTC)
 PATTERN = np.array([[0, 1, 2, 3], [1, 2, 3, 4], [2, 3, 4, 0]])
@@ -342,6 +346,24 @@ try:
 except ValueError as error:
     sys.exit(f"said: {error}")
 """
+
+
+@pytest.mark.parametrize(
+    "error",
+    [OSError(errno.EFBIG, "too large"), OSError("Error writing bytes to file. Detail: [errno 27] File too large")],
+    ids=["system", "Arrow"],
+)
+@pytest.mark.parametrize("beside", [replacing, folder_beside])
+def test_a_full_disk_names_the_output(beside: Any, error: OSError, tmp_path: Path) -> None:
+    path = tmp_path / "out.csv"
+    with (
+        pytest.raises(SessionError, match=r"out.csv: file: cannot be written \(File too large\); free space"),
+        beside(path),
+    ):
+        raise error
+    with pytest.raises(PermissionError), beside(path):
+        raise PermissionError(errno.EACCES, "of an input")
+    assert not os.listdir(tmp_path)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs file size limits")

@@ -8,6 +8,7 @@ A file appears under its name only when it is whole.
 
 import abc
 import contextlib
+import errno
 import functools
 import hashlib
 import io
@@ -63,7 +64,8 @@ def folder_beside(output: Path) -> Iterator[Path]:
     output.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{output.name}.", suffix=".tmp", dir=output.parent))
     try:
-        yield temporary
+        with disk_full_named(output):
+            yield temporary
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -137,8 +139,9 @@ def replacing(path: Path, *, session: bool = False) -> Iterator[Path]:
     descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
     try:
         _lock(descriptor)
-        yield temporary
-        sync(temporary)
+        with disk_full_named(path):
+            yield temporary
+            sync(temporary)
         os.replace(temporary, path)
         with contextlib.suppress(OSError):  # some systems cannot sync a folder
             sync(path.parent)
@@ -190,8 +193,30 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         what = f"cannot be written ({error.strerror or printable(error, 120)})"
-        todo = "free space on the disk, or write to another folder"
-        raise problem(path, "file", what, todo) from error
+        raise problem(path, "file", what, FREE_SPACE) from error
+
+
+FREE_SPACE = "free space on the disk, or write to another folder"
+_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+_NUMBER_IN_TEXT = re.compile(r"\[errno (\d+)\]", re.IGNORECASE)
+
+
+def disk_full(error: OSError) -> str:
+    """What the system says of a disk that is full, or of a file that is too large for it; empty for other errors."""
+    said = _NUMBER_IN_TEXT.search(str(error))  # Arrow states the number in its text alone
+    number = error.errno or (int(said[1]) if said else 0)
+    return os.strerror(number) if number in _FULL else ""
+
+
+@contextlib.contextmanager
+def disk_full_named(path: Path) -> Iterator[None]:
+    """Turn the error of a full disk into one `SessionError` that names the output; other errors pass."""
+    try:
+        yield
+    except OSError as error:
+        if why := disk_full(error):
+            raise problem(path, "file", f"cannot be written ({why})", FREE_SPACE) from error
+        raise
 
 
 class _FailureTolerantFile(io.RawIOBase):
