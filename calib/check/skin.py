@@ -16,6 +16,7 @@ RIM_POINTS = 256  # along the rim of the sheet, whose distances to the electrode
 MAX_RIM_PITCHES = 10.0  # distances between neighbouring electrodes, by which a sheet may reach beyond them
 MAX_PAD_BEYOND = 0.5  # share of a pad that may lie more than one such distance outside of all electrodes
 MAX_OVERLAP = 0.02  # of the smaller of two pads
+VOLTAGES = 1e-9, 1e3  # V: least and greatest largest reading that electronics can measure
 PAD_POINTS = 32  # along each side of a pad's box, at which that share is counted
 
 
@@ -42,6 +43,22 @@ def skin_findings(skin: je.Skin) -> Iterator[Finding]:
         twice = ", ".join(map(str, rows[count > 1][0].tolist()))
         what = f"{(count > 1).sum()} of {len(rows)} readings are taken more than once, as that of electrodes {twice}"
         yield Finding(Severity.WARNING, "/device", what, "name each reading once: a second one tells no new place")
+
+
+def voltage_findings(readings: np.ndarray) -> Iterator[Finding]:
+    """What is wrong with the sizes (readings,) V of the readings that a skin's model gives without contact."""
+    remedy = "correct the sheet resistance, or the current of the protocol"
+    low, high = VOLTAGES
+    largest = float(np.max(readings, initial=0.0))
+    if not np.isfinite(largest):
+        what = "the readings of the untouched skin are beyond all numbers"
+        yield Finding(Severity.WARNING, "/device", what, remedy)
+    elif not low <= largest <= high:
+        what = (
+            f"the largest reading of the untouched skin is {largest:.3g} V; electronics measure no signal "
+            f"{'above 1 kV' if largest > high else 'below 1 nV'}"
+        )
+        yield Finding(Severity.WARNING, "/device", what, remedy)
 
 
 def _own_skin(session: Session, findings: list[Finding]) -> je.Skin | None:

@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, ImportError) as error:
         if isinstance(error, BrokenPipeError) and _nobody_reads():
             return 128 + signal.SIGPIPE  # as a shell reports a program that the signal ended
-        say(one_line(error))
+        say(_with_remedy(error))
         return 2
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
@@ -71,6 +71,16 @@ def _run(argv: list[str]) -> int:
         return status
     finally:
         sys.stdout.flush()
+
+
+def _with_remedy(error: Exception) -> str:
+    """The message of an error; of a disk that is full also what to do, where the error does not name it."""
+    if not isinstance(error, OSError) or error.filename is not None:
+        return one_line(error)
+    from ..session.hdf5.storage import FREE_SPACE, disk_full
+
+    why = disk_full(error)
+    return f"the output cannot be written ({why}); {FREE_SPACE}" if why else one_line(error)
 
 
 def _nobody_reads() -> bool:

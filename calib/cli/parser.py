@@ -6,6 +6,8 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn
 
+from .terminal import plain
+
 
 class _WholeNames(argparse.HelpFormatter):
     """Lines that end between words: names of options and choices hold hyphens, and are to be copied."""
@@ -24,7 +26,8 @@ class CommandParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """End with exit status 2, and one line in place of the usage, which may be longer than the screen."""
-        self.exit(2, f"{self.prog}: {_nearest_choice(message)} ({self.prog} --help)\n")
+        line = plain(" ".join(_nearest_choice(message).splitlines()))
+        self.exit(2, f"{self.prog}: {line} ({self.prog} --help)\n")
 
     def refuse(self, others: Sequence[str]) -> NoReturn:
         """End with the first of the arguments that no parser took, and the nearest option."""

@@ -16,9 +16,19 @@ LONG_NODES = 5000
 """Number of mesh nodes with which the first voltages take about 10 s, including mesh and compilation."""
 
 
+def plain(text: object) -> str:
+    """A text with "?" in place of control characters: names in files are not trusted, and a terminal obeys these."""
+    return "".join(c if c.isprintable() or c in "\n\t" else "?" for c in str(text))
+
+
+def show(text: object) -> None:
+    """Print results for a reader on standard output, without control characters."""
+    print(plain(text), flush=True)
+
+
 def say(line: str) -> None:
     """Print a line about the work on standard error, where it does not mix with results."""
-    print(f"jaxeit: {line}", file=sys.stderr, flush=True)
+    print(f"jaxeit: {plain(' '.join(line.splitlines()))}", file=sys.stderr, flush=True)
 
 
 def say_interrupted(interrupt: KeyboardInterrupt, what: str) -> int:
@@ -29,7 +39,7 @@ def say_interrupted(interrupt: KeyboardInterrupt, what: str) -> int:
 
 def one_line(error: Exception) -> str:
     """The message of an error, on one line."""
-    return " ".join(str(error).split()) or type(error).__name__
+    return plain(" ".join(str(error).split())) or type(error).__name__
 
 
 def title(names: str, simulated: bool) -> str:
@@ -41,7 +51,7 @@ def progress_bar(text: str) -> Callable[[Iterable[Any]], Iterable[Any]]:
     """A wrapper of an iterable that shows a progress bar; no bar if standard error is no terminal."""
     from tqdm import tqdm
 
-    return partial(tqdm, desc=text, disable=None, leave=False)
+    return partial(tqdm, desc=plain(text), disable=None, leave=False)
 
 
 @contextmanager
@@ -52,7 +62,7 @@ def stage_bar(count: int) -> Iterator[Callable[[str], None]]:
     with tqdm(total=count, disable=None, leave=False) as bar:
 
         def begin(stage: str) -> None:
-            bar.set_description(stage)
+            bar.set_description(plain(stage))
             bar.update()
 
         yield begin
@@ -65,7 +75,7 @@ def status_line() -> Iterator[Callable[[str], None]]:
         yield lambda line: None
         return
     try:
-        yield lambda line: print(f"\r\033[K{line}", end="", file=sys.stderr, flush=True)
+        yield lambda line: print(f"\r\033[K{plain(line)}", end="", file=sys.stderr, flush=True)
     finally:
         print("\r\033[K", end="", file=sys.stderr, flush=True)
 
@@ -90,5 +100,5 @@ def byte_bar(total: int, text: str) -> Iterator[Callable[[int], object]]:
     """A progress bar of `total` bytes; call its value with the number of bytes done since the last call."""
     from tqdm import tqdm
 
-    with tqdm(total=total, desc=text, unit="B", unit_scale=True, disable=None, leave=False) as bar:
+    with tqdm(total=total, desc=plain(text), unit="B", unit_scale=True, disable=None, leave=False) as bar:
         yield bar.update

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from calib.cli import COMMANDS, main
+from calib.cli.terminal import say
 
 
 @pytest.fixture(scope="module")
@@ -166,6 +167,53 @@ def test_check_of_a_skin_file_says_what_can_hardly_be(tmp_path, skin, capsys):
     assert "1 of 2 readings are taken more than once, as that of electrodes 0, 1, 2, 3" in said
     assert "50 % of pad 'upper left' or 'upper right' lie within the other one" in said
     assert "Nothing wrong" not in said
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("sheet_resistance = ", "sheet_resistance = 1e9 # ", "no signal above 1 kV"),
+        ("sheet_resistance = ", "sheet_resistance = 1e-8 # ", "no signal below 1 nV"),
+        ("current = ", "current = 1e6 # ", "no signal above 1 kV"),
+    ],
+)
+def test_check_of_a_skin_file_warns_of_voltages_that_nothing_measures(old, new, said, tmp_path, skin, capsys):
+    (tmp_path / "mine.toml").write_text(skin.toml.replace(old, new, 1))
+    assert main(["check", str(tmp_path / "mine.toml")]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "the largest reading of the untouched skin is " in told
+    assert said in told
+    assert "Nothing wrong" not in told
+
+
+def test_names_reach_the_terminal_without_control_characters(tmp_path, skin, capsys):
+    name = r'name = "a\nb\u001b[31mred\u202e"'
+    path = tmp_path / "mine.toml"
+    path.write_text(skin.toml.replace('name = "testbed"', name, 1).replace('"lower left"', r'"le\nft\u001b"', 1))
+    assert main(["check", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert "skin a?b?[31mred?, 200 x 200 mm\n" in said
+    assert "pads: le?ft?, lower right" in said
+    assert main(["check", str(tmp_path / "no\nsuch\x1b.toml")]) == 2
+    assert "no such?.toml: no such file" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["check", str(path), "--al\x1b\u202e"])
+    assert "--al??: not known" in capsys.readouterr().err
+    say("a skin\nb\x1b\u202e")
+    assert capsys.readouterr().err == "jaxeit: a skin b??\n"
+
+
+def test_a_full_disk_says_what_to_do_where_no_file_is_known():
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "calib.cli", "--version"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 2
+    assert "the output cannot be written (No space left on device); free space on the disk" in done.stderr
 
 
 def test_check_of_the_bundled_sessions(bundled, capsys):

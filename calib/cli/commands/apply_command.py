@@ -12,7 +12,7 @@ from ..arguments import (
     require_matplotlib_for,
 )
 from ..recipe_options import add_low_pass_argument, processing_of, refuse_low_pass
-from ..terminal import progress_bar
+from ..terminal import progress_bar, show
 
 if TYPE_CHECKING:
     from ...calibration import LogCalibration
@@ -68,14 +68,14 @@ def run(args: argparse.Namespace) -> int:
             proposal=proposal_of(args.proposal),
             load_settings=LoadSettings.round_tips() if args.round_tips else None,
             track=args.track,
-            tell=print,
+            tell=show,
         )
         frames = len(session.stream("eit"))
     if args.report is not None:
         from ...report.track_report import write_track_report
 
         write_track_report(args.report, args.output, calibration.skin)
-    print(f"{args.output}: {frames} force maps in newtons")
+    show(f"{args.output}: {frames} force maps in newtons")
     return 0
 
 
@@ -103,7 +103,7 @@ def _run_log(args: argparse.Namespace, calibration: "LogCalibration") -> int:
     with open_session(args.session) as session:
         found = apply_log(calibration, session, args.output, ignore_errors=args.force)
     outside = (~found.valid).mean() if len(found.valid) else 0.0
-    print(f"{args.output}: {len(found.force)} forces in newtons, {outside:.1%} outside the calibrated range")
+    show(f"{args.output}: {len(found.force)} forces in newtons, {outside:.1%} outside the calibrated range")
     if unseen := calibration.unseen(found.force):
-        print(f"note: {unseen}")
+        show(f"note: {unseen}")
     return 0

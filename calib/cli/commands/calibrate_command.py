@@ -13,7 +13,7 @@ from ...calibration.recipe_text import NONE, SWITCHES
 from ...session import Session
 from ..arguments import count, prepare_results, require_matplotlib_for, skin_of
 from ..recipe_options import IMAGING, add_recipe_arguments, recipe_of
-from ..terminal import announce_model, stage_bar, title
+from ..terminal import announce_model, show, stage_bar, title
 
 if TYPE_CHECKING:
     from ...calibration import Calibration
@@ -83,9 +83,9 @@ def _calibrate_together(args: argparse.Namespace) -> int:
         own = calibration.evaluation.summary() | {"notes": list(calibration.notes)}
         _print_json(own, tried)
         return 0
-    print(_rendered(calibration, title(_names(args), calibration.simulated)))
+    show(_rendered(calibration, title(_names(args), calibration.simulated)))
     for name, found in tried.items():
-        print("\n" + render_table(found, title(name, tests[name].simulated)))
+        show("\n" + render_table(found, title(name, tests[name].simulated)))
     _print_written(args)
     return 0
 
@@ -114,7 +114,7 @@ def _names(args: argparse.Namespace) -> str:
 
 
 def _print_written(args: argparse.Namespace) -> None:
-    print(f"\nwrote {args.output}" + (f" and {args.report}" if args.report else ""))
+    show(f"\nwrote {args.output}" + (f" and {args.report}" if args.report else ""))
 
 
 def _calibrate_many(args: argparse.Namespace) -> int:
@@ -148,7 +148,7 @@ def _calibrate_many(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({o.session: o.summary or {"failed": o.reason} for o in outcomes}, indent=2, sort_keys=True))
     else:
-        print(render_outcomes(outcomes, args.output))
+        show(render_outcomes(outcomes, args.output))
     return 2 if any(outcome.reason for outcome in outcomes) else 0
 
 
@@ -185,9 +185,9 @@ def _calibrate_logs(args: argparse.Namespace, recipe: Recipe, sessions: Sequence
     if args.json:
         _print_json(calibration.evaluation.summary(), tried)
         return 0
-    print(render_log(title(_names(args), calibration.simulated), calibration))
-    print("\n" + render_evaluation(calibration.evaluation))
+    show(render_log(title(_names(args), calibration.simulated), calibration))
+    show("\n" + render_evaluation(calibration.evaluation))
     for name, found in tried.items():
-        print("\n" + render_evaluation(found, name))
+        show("\n" + render_evaluation(found, name))
     _print_written(args)
     return 0

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ..arguments import skin_of
-from ..terminal import one_line, progress_bar, say
+from ..terminal import one_line, progress_bar, say, show
 
 if TYPE_CHECKING:
     from ...session import Session
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
         if path.endswith(".toml"):
             if args.json:
                 raise ValueError(f"{path}: is a skin, of which there is no report as JSON; leave out --json")
-            print(_described(path))
+            show(_described(path))
             continue
         try:
             with open_session(path) as session:
@@ -59,23 +59,26 @@ def run(args: argparse.Namespace) -> int:
 
 def _described(path: str) -> str:
     """What a skin's file describes, and what its model reads without contact, in words."""
+    import numpy as np
+
     import jaxeit as je
 
-    from ...check.skin import skin_findings
+    from ...check.skin import skin_findings, voltage_findings
     from ...check.text import findings_text
+    from ...session.errors import printable
 
     skin = je.load_skin(path)
     try:
         model = je.discretise(je.Scene(skin, effects=()), je.Fidelity.draft())
     except ValueError as error:
         raise ValueError(f"{path}: {one_line(error)}") from None
-    readings = 1e3 * abs(je.forward(model))  # mV
+    readings = 1e3 * np.abs(je.forward(model))  # mV
     low, high = skin.domain.bounds
     width, height = (1e3 * (end - start) for start, end in zip(low, high, strict=True))
-    pads = ", ".join(pad.name for pad in skin.pads) or "none"
-    doubts = "\n".join(findings_text(list(skin_findings(skin))))
+    pads = ", ".join(printable(pad.name) for pad in skin.pads) or "none"
+    doubts = "\n".join(findings_text([*skin_findings(skin), *voltage_findings(1e-3 * readings)]))
     return (
-        f"{path}: skin {skin.name}, {width:.4g} x {height:.4g} mm\n"
+        f"{printable(path, 300)}: skin {printable(skin.name)}, {width:.4g} x {height:.4g} mm\n"
         f"{len(skin.electrodes)} electrodes; pads: {pads}\n"
         f"{len(readings)} readings in {1e3 * skin.protocol.frame_time:.3g} ms; without contact "
         f"{readings.min():.3g} to {readings.max():.3g} mV\n"

@@ -2,6 +2,8 @@
 
 import argparse
 
+from ..terminal import show
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """No arguments."""
@@ -14,5 +16,5 @@ def run(args: argparse.Namespace) -> int:
     from ..diagnosis import examine
 
     lines = examine()
-    print("\n".join(line.render() for line in lines))
+    show("\n".join(line.render() for line in lines))
     return 0 if all(line.ok for line in lines) else 2

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..recipe_options import add_low_pass_argument, processing_of, refuse_low_pass
-from ..terminal import progress_bar, title
+from ..terminal import progress_bar, show, title
 
 if TYPE_CHECKING:
     from ...calibration import LogCalibration
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
             heading = title(session.name, session.simulated)
         results[Path(path).name] = found.summary()
         if not args.json:
-            print(render_table(found, heading))
+            show(render_table(found, heading))
     if args.json:
         print(json.dumps(results, indent=2, sort_keys=True))
     return 0
@@ -62,7 +62,7 @@ def _evaluate_logs(args: argparse.Namespace, calibration: "LogCalibration") -> i
             heading = title(session.name, session.simulated)
         results[Path(path).name] = found.summary()
         if not args.json:
-            print(render_evaluation(found, heading))
+            show(render_evaluation(found, heading))
     if args.json:
         print(json.dumps(results, indent=2, sort_keys=True))
     return 0

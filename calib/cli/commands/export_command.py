@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Callable
 
 from ..arguments import prepare_results
-from ..terminal import progress_bar, say
+from ..terminal import progress_bar, say, show
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     from ...runtime import set_up
 
     set_up()
-    print(f"{args.output}: {args.export(args)}")
+    show(f"{args.output}: {args.export(args)}")
     return 0
 
 

@@ -4,7 +4,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from ..arguments import above_zero, prepare_results
-from ..terminal import title
+from ..terminal import show, title
 
 if TYPE_CHECKING:
     from ...calibration import LogCalibration
@@ -57,11 +57,11 @@ def run(args: argparse.Namespace) -> int:
     moved.save(args.output)
     found = moved.recalibration
     assert found is not None
-    print(found.to_json() if args.json else f"{heading}\n{render(found)}")
+    print(found.to_json()) if args.json else show(f"{heading}\n{render(found)}")
     if moved.layer is not None and not args.json:
-        print(render_layer(moved.layer, moved.recon))
+        show(render_layer(moved.layer, moved.recon))
     if moved.contact_law is not None and not args.json:
-        print(f"force without pads: {moved.contact_law.render()}")
+        show(f"force without pads: {moved.contact_law.render()}")
     return 0
 
 
@@ -80,5 +80,5 @@ def _recalibrate_log(args: argparse.Namespace, calibration: "LogCalibration", dr
         heading = title(session.name, session.simulated)
     moved.save(args.output)
     assert moved.shift is not None
-    print(moved.shift.to_json() if args.json else f"{heading}\n{render_shift(moved.shift)}")
+    print(moved.shift.to_json()) if args.json else show(f"{heading}\n{render_shift(moved.shift)}")
     return 0

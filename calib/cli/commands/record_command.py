@@ -4,7 +4,7 @@ import argparse
 
 from ..arguments import above_zero, prepare_outputs, skin_of
 from ..signals import orderly_end
-from ..terminal import say, status_line
+from ..terminal import say, show, status_line
 
 _STREAMS = ("eit", "pressure", "force", "stage", "temperature", "barometer")
 
@@ -44,5 +44,5 @@ def run(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         say(f"interrupted; the recording is kept: jaxeit recover {journal_path(args.output)}")
         return 130
-    print(summary.render())
+    show(summary.render())
     return orders.status or (0 if summary.complete else 2)

@@ -5,7 +5,7 @@ import os
 import shlex
 
 from ..arguments import prepare_outputs
-from ..terminal import byte_bar, file_size
+from ..terminal import byte_bar, file_size, show
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,6 +26,6 @@ def run(args: argparse.Namespace) -> int:
     prepare_outputs(args, "output")
     with byte_bar(2 * file_size(args.journal), "recovering") as progress:
         summary = convert_journal(args.journal, output, recovered=True, progress=progress)
-    print(summary.render())
-    print(f"look at it ({shlex.join(['jaxeit', 'check', output])}); {args.journal} may then be deleted")
+    show(summary.render())
+    show(f"look at it ({shlex.join(['jaxeit', 'check', output])}); {args.journal} may then be deleted")
     return 0

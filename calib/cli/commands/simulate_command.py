@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..arguments import count, prepare_outputs, prepare_results, skin_of
-from ..terminal import announce_model, progress_bar, say, say_interrupted
+from ..terminal import announce_model, progress_bar, say, say_interrupted, show
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         return _simulate_robot(args)
     bench = load_bench(args.scene)
     if args.explain:
-        print(render_costs(bench, measure_costs(bench)))
+        show(render_costs(bench, measure_costs(bench)))
         return 0
     prepare_outputs(args, "output")
     if args.serve and Path(args.output).exists():
@@ -97,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
         simulate(bench, args.output, progress=progress_bar("blocks"))
     except KeyboardInterrupt as interrupt:
         return say_interrupted(interrupt, f"the same command goes on from {args.output}.part")
-    print(f"{args.output}: {len(bench.sites)} presses, {bench.duration:.0f} s, SIMULATED{_saturation(args.output)}")
+    show(f"{args.output}: {len(bench.sites)} presses, {bench.duration:.0f} s, SIMULATED{_saturation(args.output)}")
     return _serve(args.output) if args.serve else 0
 
 
@@ -130,8 +130,8 @@ def _serve(path: str) -> int:
         shown = chain(*(urls[name] for name in ("eit", "pressure") if name in urls))
         live = shlex.join(["jaxeit", "live", "--calibration", "calibration.h5", *shown])
         with suppress(KeyboardInterrupt):
-            print(f"serving {path}, SIMULATED; in another terminal: {record}", flush=True)
-            print(f"or, with a calibration: {live}", flush=True)
+            show(f"serving {path}, SIMULATED; in another terminal: {record}")
+            show(f"or, with a calibration: {live}")
             threading.Event().wait()
     return 0
 
@@ -155,7 +155,7 @@ def _simulate_data_set(args: argparse.Namespace) -> int:
     prepare_results(args, "output")
     skin, progress = skin_of(str(args.scene)), progress_bar("contacts")
     places, steps = write_data_set(skin, args.output, columns=args.data_set, rows=args.data_set, progress=progress)
-    print(f"{args.output}: {places} places, {steps} amplitudes, SIMULATED")
+    show(f"{args.output}: {places} places, {steps} amplitudes, SIMULATED")
     return 0
 
 
@@ -207,7 +207,7 @@ def _simulate_robot(args: argparse.Namespace) -> int:
         fidelity=_fidelity_of(args),
         progress=progress_bar("frames"),
     )
-    print(f"{args.output}: {seconds:g} s of {args.mujoco}, SIMULATED")
+    show(f"{args.output}: {seconds:g} s of {args.mujoco}, SIMULATED")
     return 0
 
 
@@ -233,7 +233,7 @@ def _simulate_random_scenes(args: argparse.Namespace) -> int:
             )
         except KeyboardInterrupt as interrupt:
             return say_interrupted(interrupt, f"the same command goes on from the shards in {args.output}")
-    print(f"{args.output}: {_frames_text(written, time.monotonic() - start)}, SIMULATED")
+    show(f"{args.output}: {_frames_text(written, time.monotonic() - start)}, SIMULATED")
     return 0
 
 

@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from ..arguments import count, prepare_results, skin_of
-from ..terminal import say_interrupted
+from ..terminal import say_interrupted, show
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,11 +45,11 @@ def run(args: argparse.Namespace) -> int:
         except KeyboardInterrupt as interrupt:
             return say_interrupted(interrupt, f"the same command goes on from {args.output}.parts")
     told = found.about["held_out"]
-    print(f"of {told['frames']:,} frames of {told['skins']} skins held out, {told['kinds_told']:.0%} are told rightly:")
+    show(f"of {told['frames']:,} frames of {told['skins']} skins held out, {told['kinds_told']:.0%} are told rightly:")
     for name, row in told["kinds"].items():
         place = f", place within {row['place_mm_median']:.1f} mm (median)" if "place_mm_median" in row else ""
-        print(f"  {name}: {row['told']:.0%} of {row['frames']:,}{place}")
-    print(f"{args.output}: written after {time.monotonic() - began:.0f} s, trained on SIMULATED skins")
+        show(f"  {name}: {row['told']:.0%} of {row['frames']:,}{place}")
+    show(f"{args.output}: written after {time.monotonic() - began:.0f} s, trained on SIMULATED skins")
     return 0
 
 

@@ -165,5 +165,6 @@ def run(args: argparse.Namespace, skin: "je.Skin | None" = None) -> int:
     """Import as parsed by `add_arguments`, ``skin`` being the one named; prints the report. Raises `SessionError`."""
     progress = partial(tqdm, desc="lines", unit="", disable=None, leave=False)
     about = About(args.title, args.license, parse_epoch(args.epoch), skin, progress)
-    print(find_importer(args.format).convert(args, Path(args.output), about).summary())
+    summary = find_importer(args.format).convert(args, Path(args.output), about).summary()
+    print("\n".join(printable(line, 1000) for line in summary.splitlines()))
     return 0
