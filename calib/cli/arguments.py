@@ -94,6 +94,14 @@ def prepare_results(args: argparse.Namespace, *names: str) -> None:
             require_no_session(Path(path))
 
 
+def picture_kind(path: str) -> str:
+    """The format of a picture by the end of its name: png, pdf or svg; ValueError for another end."""
+    kind = Path(path).suffix.lower()[1:]
+    if kind not in ("png", "pdf", "svg"):
+        raise ValueError(f"{path}: give a name that ends in .png, .pdf or .svg")
+    return kind
+
+
 def _words(value: object) -> list[str]:
     """The words in the value of an argument."""
     if dataclasses.is_dataclass(value):

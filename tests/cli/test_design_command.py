@@ -1,6 +1,7 @@
 """`jaxeit design`: the skin it writes, and a session that is simulated and checked with it."""
 
 import re
+import signal
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ import pytest
 import calib
 import jaxeit as je
 from calib.cli import main
+from calib.cli.signals import Terminated
+from calib.report.figures import parts
 
 SKIN = """
 format = "jaxeit-skin"
@@ -121,6 +124,20 @@ def test_a_design_moves_electrodes(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_design_that_is_ended_during_its_picture_writes_nothing(tmp_path, monkeypatch, capsys):
+    def ended(*_):
+        raise Terminated(signal.SIGTERM)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(parts, "write_figure", ended)
+    (tmp_path / "mine.toml").write_text(SKIN)
+    assert main(["design", "mine.toml", "-o", "better.toml", "--readings", "12", "--picture", "map.png"]) == 143
+    told = capsys.readouterr()
+    assert "nothing was written" in told.err
+    assert "written after" not in told.out
+    assert {path.name for path in tmp_path.iterdir()} == {"mine.toml"}
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -132,6 +149,8 @@ def test_a_design_moves_electrodes(tmp_path, monkeypatch, capsys):
         (["--criterion", "best"], 'no criterion \'best\'; give one of "place-error", "d-optimal"'),
         (["--criterion", "place-error:power=-1"], "power"),
         (["--readings", "46", "--switch", "0", "--relative-noise", "0"], "there are 45 candidates"),
+        (["--readings", "12", "--width", "1e-9"], "--width 1e-09: too narrow for the model's mesh; give at least 0.00"),
+        (["--readings", "12", "--picture", "dx.toml"], "dx.toml: give a name that ends in .png, .pdf or .svg"),
         (["--readings", "9", "--switch", "9"], "before one drive has settled"),
     ],
 )

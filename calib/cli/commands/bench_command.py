@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..arguments import above_zero, prepare_results, require_matplotlib_for
+from ..arguments import above_zero, picture_kind, prepare_results, require_matplotlib_for
 from ..recipe_options import add_imaging_arguments, imaging_of
-from ..terminal import announce_model, progress_bar
+from ..terminal import announce_model, progress_bar, show
 
 if TYPE_CHECKING:
     from jaxeit.accuracy import Choice, Ladder
@@ -39,6 +39,7 @@ def run(args: argparse.Namespace) -> int:
 
     prepare_results(args, "output")
     if args.output:
+        picture_kind(args.output)
         require_matplotlib_for("-o")
     rungs, budget = _rungs(args), 0.1 if args.smoke else 0.5
     scene = bench_scene(args.what)
@@ -50,9 +51,9 @@ def run(args: argparse.Namespace) -> int:
     wishes = {"budget_ms": args.budget_ms, "error": args.error}
     wanted = any(wish is not None for wish in wishes.values())
     if not args.json:
-        print(found.table(get_terminal_size((110, 24)).columns), flush=True)
+        show(found.table(get_terminal_size((110, 24)).columns))
         if wanted:
-            print("\n" + found.advice(**wishes))
+            show("\n" + found.advice(**wishes))
         return 0
     report = found.summary()
     try:

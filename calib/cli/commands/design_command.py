@@ -6,12 +6,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from ..arguments import above_zero, at_least_zero, count, prepare_results, require_matplotlib_for, skin_of
-from ..terminal import announce_model, progress_bar
+from ..arguments import above_zero, at_least_zero, count, picture_kind, prepare_results, require_matplotlib_for, skin_of
+from ..terminal import announce_model, progress_bar, show
 
 if TYPE_CHECKING:
     import jaxeit as je
     from jaxeit.scan import AbstractCriterion, DesignSettings, PlacementLimits, PlaceSensitivity, ScanDesign
+
+MIN_WIDTH = 0.1  # of the longest edge of the mesh: narrower contacts fall between the points of integration
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -76,6 +78,7 @@ def run(args: argparse.Namespace) -> int:
     set_up()
     prepare_results(args, "output", "picture")
     if args.picture:
+        picture_kind(args.picture)
         require_matplotlib_for("--picture")
     began, skin = perf_counter(), _asked_skin(args)
     criterion = je.scan.CRITERIA.make(args.criterion, allow_import=True)
@@ -84,10 +87,10 @@ def run(args: argparse.Namespace) -> int:
     made = _designed(args, skin, criterion, limits, readings)
     with replacing(Path(args.output)) as new:
         new.write_text(made.skins[1].toml, encoding="utf-8")
-    print("\n".join(_report(made, args.switch)))
-    print(f"{args.output}: written after {perf_counter() - began:.0f} s")
-    if args.picture:
-        _write_picture(made, Path(args.picture))
+        if args.picture:
+            _write_picture(made, Path(args.picture))  # first, so that an interruption leaves both files or none
+    show("\n".join(_report(made, args.switch)))
+    show(f"{args.output}: written after {perf_counter() - began:.0f} s")
     return 0
 
 
@@ -143,9 +146,17 @@ def _designed(
 
 
 def _sensitivity(skin: "je.Skin", settings: "DesignSettings") -> "PlaceSensitivity":
+    """What each reading tells of contacts; ValueError for contacts that fall between the points of the model."""
+    import numpy as np
+
     import jaxeit as je
 
-    return je.scan.place_sensitivity(je.discretise(je.Scene(skin), je.Fidelity.draft()), settings)
+    model = je.discretise(je.Scene(skin), je.Fidelity.draft())
+    corners = np.asarray(model.chart)[np.asarray(model.triangles)]
+    least = MIN_WIDTH * float(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=2).max())
+    if settings.width < least:
+        raise ValueError(f"--width {settings.width:g}: too narrow for the model's mesh; give at least {least:.2g} m")
+    return je.scan.place_sensitivity(model, settings)
 
 
 def _circle(text: str) -> tuple[float, float, float]:

@@ -6,7 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..arguments import above_zero, prepare_results, require_matplotlib_for, skin_of
+from ..arguments import above_zero, picture_kind, prepare_results, require_matplotlib_for, skin_of
+from ..terminal import show
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -66,9 +67,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ...session import replacing
 
-    kind = Path(args.output).suffix.lower()[1:]
-    if kind not in ("png", "pdf", "svg"):
-        raise ValueError(f"{args.output}: give a name that ends in .png, .pdf or .svg")
+    kind = picture_kind(args.output)
     prior, method = je.imaging.PRIORS.make(args.prior), je.imaging.METHODS.make(args.method)
     _require_one_kind(args)
     tank = _tank(args)
@@ -84,14 +83,17 @@ def run(args: argparse.Namespace) -> int:
     with replacing(Path(args.output)) as new:
         figure.savefig(new, format=kind, dpi=150)
     count, readings = len(tank.skin.electrodes), tank.skin.protocol.readings
-    print(f"{count} electrodes, {readings} readings, {_listed(tank.names)}")
-    print("\n".join(lines))
+    show(f"{count} electrodes, {readings} readings, {_listed(tank.names)}")
+    show("\n".join(lines))
     return 0
 
 
 def _listed(names: tuple[str, ...]) -> str:
     """The names of frames, or the first and the last of a recording."""
-    return f"{len(names)} frames: {names[0]} to {names[-1]}" if len(names) > 12 else f"frames: {', '.join(names)}"
+    from ...session.errors import printable
+
+    shown = [printable(name) for name in names]
+    return f"{len(names)} frames: {shown[0]} to {shown[-1]}" if len(names) > 12 else f"frames: {', '.join(shown)}"
 
 
 def _change(args: argparse.Namespace, tank: "Tank", prior: "AbstractPrior", method: Any, axes: "Axes") -> list[str]:

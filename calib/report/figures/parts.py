@@ -22,6 +22,7 @@ except ImportError:
 
 MM = 1e3
 DPI = 125
+UNDATED = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}  # equal figures give equal files
 RED, GREEN, BLUE, GREY = "#c62828", "#2e7d32", "#1f5fa8", "#8a8a8a"
 OUTLINE = "#747474"  # of pads, on white, on black and on maps
 MARKS = ("#d9730d", "#7b3fa0", "#00838f", "#6d4c41")
@@ -51,9 +52,13 @@ def plain_numbers(axes: Any) -> None:
 
 
 def write_figure(figure: "Figure", path: Path) -> None:
-    """The figure as a PNG file at a path, whole or not at all."""
+    """The figure at a path, whole or not at all: PDF or SVG by the end of its name, or else PNG."""
+    kind = path.suffix.lower()
     with replacing(path) as new:
-        new.write_bytes(png(figure))
+        if kind in UNDATED:
+            figure.savefig(new, format=kind[1:], metadata=UNDATED[kind])
+        else:
+            new.write_bytes(png(figure))
 
 
 def png(figure: "Figure") -> bytes:
