@@ -413,7 +413,11 @@ def test_failure_leaves_the_old_files_and_nothing_else(calibration, no_pictures,
     page = tmp_path / "page.html"
     page.write_text("old")
 
+    written = type(page).write_bytes
+
     def full(path, data):
+        if path.parent != tmp_path:  # the cache of compiled programs
+            return written(path, data)
         with open(path, "wb") as file:
             file.write(data[: len(data) // 2])
         raise OSError(28, "No space left on device")

@@ -29,7 +29,7 @@ from h5py import h5d, h5f, h5fd, h5g, h5p, h5s, h5t
 
 from jaxeit.files import open_regular
 
-from ..errors import printable, problem
+from ..errors import SessionError, printable, problem
 from ..tables import FORMAT
 from .guard import MAX_ATTRIBUTE_BYTES
 
@@ -191,9 +191,15 @@ def writing(path: Path) -> Iterator[None]:
     """Turn a failed write (disk full, no permission) into one `SessionError`."""
     try:
         yield
+    except DiskFullError:  # it names the output already
+        raise
     except OSError as error:
         what = f"cannot be written ({error.strerror or printable(error, 120)})"
         raise problem(path, "file", what, FREE_SPACE) from error
+
+
+class DiskFullError(SessionError, OSError):
+    """A disk is full: an `OSError`, as the system raises it, with the output and the remedy in its message."""
 
 
 FREE_SPACE = "free space on the disk, or write to another folder"
@@ -210,12 +216,12 @@ def disk_full(error: OSError) -> str:
 
 @contextlib.contextmanager
 def disk_full_named(path: Path) -> Iterator[None]:
-    """Turn the error of a full disk into one `SessionError` that names the output; other errors pass."""
+    """Turn the error of a full disk into one `DiskFullError` that names the output; other errors pass."""
     try:
         yield
     except OSError as error:
         if why := disk_full(error):
-            raise problem(path, "file", f"cannot be written ({why})", FREE_SPACE) from error
+            raise DiskFullError(str(problem(path, "file", f"cannot be written ({why})", FREE_SPACE))) from error
         raise
 
 
