@@ -5,6 +5,7 @@ import json
 import re
 from concurrent.futures import Executor, Future
 
+import equinox as eqx
 import h5py
 import jax.numpy as jnp
 import numpy as np
@@ -299,7 +300,8 @@ def test_a_skin_without_pads(tmp_path):
 
 
 def test_numbers_that_are_not_finite_do_not_travel():
-    law = je.effects.ContactPiezoresistance(half_pressure=jnp.inf, amplitude=jnp.inf)
+    refused = jnp.array(jnp.inf), jnp.array(jnp.inf)  # when an effect is made
+    law = eqx.tree_at(lambda law: (law.half_pressure, law.amplitude), je.effects.ContactPiezoresistance(), refused)
     made = SceneFrames(_small_bench(law=law), je.Fidelity.draft(), je.Pixels(8, 8), RandomScenes())
     with pytest.raises(BenchError, match="shard 3: frames, untouched are not finite"):
         made.simulate(3, 0, 10)
