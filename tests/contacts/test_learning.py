@@ -213,6 +213,17 @@ def test_a_fitter_of_a_texture_tells_one_tip_as_one(ready):
     assert rough(frames[0], finder(frames[0])).kind is LoadKind.ONE
 
 
+def test_presses_of_one_force_tell_no_law_of_forces(ready, monkeypatch):
+    fitter, frames = ready[0], np.zeros((7, 550))
+    monkeypatch.setattr(learning, "prepare_loads", lambda *_, **__: fitter)
+    monkeypatch.setattr(learning, "_fitted_law", lambda *_: (np.zeros(3), [Fit(np.zeros((3, 6)), 0.0, None, None)]))
+    monkeypatch.setattr(learning, "_model_error", lambda *_: (0.01, np.zeros(7)))
+    monkeypatch.setattr(learning, "_force_law", lambda *_: ForceLaw(logs=(0.1, 0.0, 0.0)))
+    for most, logs in ((19.9, (0.0, 0.0, 0.0)), (20.1, (0.1, 0.0, 0.0))):
+        forces = np.linspace(10.0, most, 7)
+        assert learn_loads(fitter.sheet.model, frames, PLACES, forces, noise=ready[3]).forces.logs == logs
+
+
 def test_presses_that_tell_nothing_are_not_counted(ready, monkeypatch):
     """The texture is that under which the others are most probable."""
     fitter, _, frames, noise = ready

@@ -64,6 +64,9 @@ STEPS, HALVINGS, MOST_STEP, LEAST_STEP = 4, 2, 0.7, 0.03
 FORCE_SPREAD = np.array([0.3, 0.3, 0.5])
 # Degrees of freedom of the errors of told forces; number of presses that count as much as what fits state of these.
 FREEDOM, STATED = 4, 8
+# Log of the largest force over the smallest, below which presses do not tell how told forces depend on the force: what
+# the law of forces then says of others is a guess.
+FORCES_APART = np.log(2)
 REWEIGHTED = 30  # times that presses are weighed, of which a few suffice
 # Chi-square of a press over the median, beyond which it is left out.
 UNUSUAL = 5.0
@@ -85,7 +88,8 @@ def learn_loads(
     """Settings of loads for `prepare_loads`, by presses of known place and force.
 
     The law of pressure, the law of forces, the texture of the gain and the model error are learned; the other settings
-    stay. Give presses of several forces all over the sheet: one force alone tells one number of the law.
+    stay. Give presses of several forces all over the sheet: one force alone tells one number of the law of pressure,
+    and no law of forces.
 
     Args:
         dv: difference frames, (n, readings) V, in each of which one tip presses, as means over holds.
@@ -129,6 +133,8 @@ def learn_loads(
             break
         learned, best = replace(tried, law=under.fitter.sheet.law, model_error=error), evidence
         starts, final = [fit.loads[:1, :4] for fit in fits], under.with_error(error)
+    if np.ptp(np.log(forces[counted])) < FORCES_APART:
+        return learned
     return replace(learned, forces=_force_law(final, starts, counted))
 
 
