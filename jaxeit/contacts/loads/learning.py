@@ -36,7 +36,7 @@ from ..._compile import require_known
 from ...imaging.noise import InverseError
 from ...model.discretisation import Model
 from .comparison import LAST_FALL, Comparison, Fit, improbability, padded
-from .considered import inverse_of, slopes_in_law
+from .considered import inverse_of, mean_errors, slopes_in_law
 from .fitter import LoadFitter
 from .model_error import fitted_model_error
 from .preparation import AbstractGain, prepare_loads, texture_modes
@@ -126,7 +126,7 @@ def learn_loads(
         textured = presses.with_texture(tried)
         logs, fits = _fitted_law(textured, logs, starts)
         under = textured.under(logs)
-        error, evidences = _model_error(under.fitter, under.y, fits)
+        error, evidences = _model_error(under, fits)
         if learned is usual:
             counted = np.isfinite(evidences)  # a press that no load explains tells nothing under any texture
         if not (evidence := float(evidences[counted].sum())) > best:
@@ -200,9 +200,10 @@ class _Presses(NamedTuple):
         """Log of the force of one press that its readings tell, over the true one; its variance, its slopes (3,)."""
         search = Comparison(self.fitter, self.y[k], None)
         fit = search.fit(LoadKind.ONE, start, LAST_FALL)
-        free, told = search.free(LoadKind.ONE, fit), search.shape(LoadKind.ONE, fit)
-        slopes = slopes_in_law(search.known(LoadKind.ONE, fit), free)[FORCE]
-        return np.log(float(told.force[0])) - self.log_force[k], float(told.covariance[FORCE, FORCE]), slopes
+        free, known = search.free(LoadKind.ONE, fit), search.known(LoadKind.ONE, fit)
+        square = mean_errors(known, free, np.asarray(self.fitter.shapes, float))[1]
+        missed = float(fit.loads[0, FORCE] - self.log_force[k])
+        return missed, float(square[FORCE, FORCE]), slopes_in_law(known, free)[FORCE]
 
     def normal(self, fits: list[Fit], kept: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Normal matrix (3, 3) and gradient (3,) of some presses in the logs of the law, in which loads give way."""
@@ -282,14 +283,13 @@ def regressed_force_law(
     return ForceLaw(tuple(logs.tolist()), tuple(map(tuple, covariance.tolist())), over)
 
 
-def _model_error(fitter: LoadFitter, y: np.ndarray, fits: list[Fit]) -> tuple[float, np.ndarray]:
+def _model_error(presses: _Presses, fits: list[Fit]) -> tuple[float, np.ndarray]:
     """The model error of single presses, of unknown force, and the log of the probability of each under it, (n,)."""
 
     def evidence(own: np.ndarray, fit: Fit, error: float) -> float:
-        under = replace(fitter, model_error=jnp.asarray(error, fitter.model_error.dtype))
-        search = Comparison(under, own, None)
+        search = Comparison(presses.with_error(error).fitter, own, None)
         return search.evidence(LoadKind.ONE, search.fit(LoadKind.ONE, fit.loads[:1, :4], LAST_FALL))
 
-    each = [cache(partial(evidence, *one)) for one in zip(y, fits, strict=True)]
-    error = fitted_model_error(each, float(fitter.model_error), SURELY)
+    each = [cache(partial(evidence, *one)) for one in zip(presses.y, fits, strict=True)]
+    error = fitted_model_error(each, float(presses.fitter.model_error), SURELY)
     return error, np.array([one(error) for one in each])
