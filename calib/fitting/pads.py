@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 import jaxeit as je
 
-from ..presses.crosstalk import own_pressures
+from ..presses.crosstalk import own_deviations, own_pressures
 from ..presses.pooled import PressData
 from .curves.base import AbstractCurve
 from .curves.fit import fit_curves
@@ -133,7 +133,8 @@ class PadModel(eqx.Module):
         floor = self._noise.floor * self._noise.scale
         if self.sensor is None:
             return floor
-        level, noisy = predict(self, jnp.stack([jnp.zeros_like(self.sensor), self.sensor])).force
+        rest = jnp.zeros_like(self.sensor)[None]
+        level, noisy = predict(self, jnp.concatenate([rest, self._noise_of_own(rest)])).force
         return jnp.hypot(floor, noisy - level)
 
     def predict(self, own: Float[Array, "n pads"], places: Places | None = None) -> Prediction:
@@ -160,8 +161,20 @@ class PadModel(eqx.Module):
         found = self.forces(readings, places, before)
         variance = found.standard_error**2 + self._noise.variance(found.force)
         if self.sensor is not None:
-            variance += (self.forces(readings + self.sensor, places, before).force - found.force) ** 2
+            # The force of a pad depends on its own pressure alone, so that all pads may be moved at once.
+            noisy = self.own(readings) + self._noise_of_own(readings)
+            variance += (self._continued(noisy, places, before).force - found.force) ** 2
         return found._replace(standard_error=jnp.sqrt(variance))
+
+    def _noise_of_own(self, readings: Float[Array, "n pads"]) -> Float[Array, "n pads"]:
+        """Standard deviation of the pads' own pressures (Pa) by the noise of the sensors, which must be known.
+
+        A channel without a reading (NaN) adds nothing to the other pads.
+        """
+        assert self.sensor is not None
+        noise = jnp.where(jnp.isfinite(readings), self.sensor, 0)
+        noise = noise if self.gains is None else self.gains.unmoved(noise)
+        return noise if self.crosstalk is None else own_deviations(self.crosstalk, noise)
 
     def pad_forces(
         self, pressures: Float[ArrayLike, "n pads"], places: Places | None = None

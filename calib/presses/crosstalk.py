@@ -66,6 +66,12 @@ def own_pressures(matrix: Float[Array, "pads pads"], pressure: Float[Array, "...
     return jnp.where(known, own, jnp.nan)
 
 
+def own_deviations(matrix: Float[Array, "pads pads"], deviation: Float[Array, "n pads"]) -> Float[Array, "n pads"]:
+    """Standard deviations of the pads' own pressures, (n, pads) Pa, from those of independent noise of the channels."""
+    inverse = solve(matrix.astype(deviation.dtype), jnp.eye(len(matrix), dtype=deviation.dtype))
+    return jnp.sqrt(deviation**2 @ (inverse**2).T)
+
+
 def fit_crosstalk(
     pressure: Float[np.ndarray, "presses pads"], position: Float[np.ndarray, "presses 2"], pads: Sequence[je.Pad]
 ) -> Crosstalk:

@@ -10,10 +10,11 @@ from scipy.special import ndtr
 from calib.fitting.curves import Linear
 from calib.fitting.fields import PadEdge, geometry_of, single_places
 from calib.fitting.held_out import Folds, folds_by_place
-from calib.fitting.intervals import fit_noise
+from calib.fitting.intervals import NORMAL_MULTIPLE, NoiseLaw, fit_noise
 from calib.fitting.losses import SoftL1
 from calib.fitting.neighbourhoods import error_scale, with_error_scale
-from calib.fitting.pads import LocatedPresses, PadModel, fit_pads
+from calib.fitting.pad_gains import PadGains
+from calib.fitting.pads import LocatedPresses, PadModel, fit_pads, forces
 from calib.fitting.response import fit_response, fold_presses, hold_out_response
 from calib.presses.pooled import MIN_SHARE, PressData
 from jaxeit.geometry.shapes import Polygon
@@ -113,6 +114,45 @@ def test_means_over_holds_have_intervals_of_their_own(skin):
         sampled = np.abs(everything.sum(1) - new.sample_force) <= wide
         covered.append([*(inside[k::3].mean() for k in range(3)), sampled.mean()])
     np.testing.assert_allclose(np.mean(covered, 0), 0.9, atol=0.05)
+
+
+def crosstalk_of(part):
+    """Crosstalk between four pads, of which each shows in the channels of the others by about a part, unevenly."""
+    return jnp.asarray(np.eye(4) + part * np.random.default_rng(3).uniform(0.5, 1.5, (4, 4)) * (1 - np.eye(4)))
+
+
+def noisy_model(skin, crosstalk, gains=None):
+    """Pads of 0.01 N/Pa whose sensors are noisy, without any noise about the model."""
+    curves = fit_pads(
+        Linear(), None, LocatedPresses(presses(np.random.default_rng(0)), geometry_of(skin)), SoftL1()
+    ).curves
+    none = NoiseLaw(jnp.zeros(()), jnp.zeros(()), jnp.ones(4), jnp.asarray(NORMAL_MULTIPLE))
+    return PadModel(curves, None, crosstalk, none, gains=gains, sensor=jnp.array([20.0, 5.0, 20.0, 40.0]))
+
+
+def scattered(model, readings):
+    """Standard deviation of the forces of 20,000 noisy readings, and that which one reading states, (pads,) N."""
+    noise = np.asarray(model.sensor) * np.random.default_rng(1).normal(size=(20_000, 4))
+    one = jnp.asarray(readings)[None]
+    known, error = forces(model, one).standard_error[0], model.pad_forces(one)[1][0]
+    return np.std(forces(model, one + noise).force, 0), np.sqrt(error**2 - known**2)
+
+
+@pytest.mark.parametrize("gains", [None, [0.3, -0.3, 0.0, 0.1]], ids=["as fitted", "moved"])
+@pytest.mark.parametrize("part", [None, 0.0, 0.1, 0.2])
+def test_noise_of_the_sensors_is_that_of_readings_with_crosstalk(skin, part, gains):
+    """Pads whose noise was added at once, with the signs of the crosstalk, had half of the noise that they show."""
+    moved = None if gains is None else PadGains(jnp.asarray(gains), jnp.zeros((4, 4)))
+    model = noisy_model(skin, None if part is None else crosstalk_of(part), moved)
+    shown, stated = scattered(model, [1500.0, 700.0, 0.0, 300.0])
+    np.testing.assert_allclose(stated, shown, rtol=0.02)
+    np.testing.assert_allclose(model.idle_noise, scattered(model, np.zeros(4))[0], rtol=0.02)
+
+
+def test_a_pad_without_a_reading_adds_no_noise_to_the_others(skin):
+    shown, stated = scattered(noisy_model(skin, crosstalk_of(0.2)), [1500.0, np.nan, 0.0, 300.0])
+    np.testing.assert_allclose(stated, shown, rtol=0.02)  # NaN for the pad itself
+    assert np.isfinite(stated[[0, 2, 3]]).all()
 
 
 def pressed(skin, sites, rng, dip, width, spread):
