@@ -86,9 +86,11 @@ def conjugate_gradients(
 ) -> Parameters:
     """x with ``times(x) = right`` for a positive definite ``times``, of which ``near_inverse`` is about the inverse.
 
+    NaN where `MAX_ITERATIONS` leave a residual that is not small: a derivative that is wrong must not be handed out.
     Has derivatives in both directions, as `jax.scipy.sparse.linalg.cg` in a compiled function has not.
     """
-    tolerance = float(jnp.finfo(right.dtype).eps) ** 1.5  # of the square of the residual, so measured
+    eps = float(jnp.finfo(right.dtype).eps)
+    tolerance, tolerable = eps**1.5, eps**0.5  # of the square of the residual, as ``near_inverse`` measures it
 
     def solve(times: Callable[[Parameters], Parameters], right: Parameters) -> Parameters:
         def unfinished(state: Gradients) -> Bool[Array, ""]:
@@ -108,7 +110,8 @@ def conjugate_gradients(
         start = near_inverse(right)
         first = right @ start
         begin: Gradients = (jnp.zeros_like(right), right, start, first, 0)
-        return jax.lax.while_loop(unfinished, again, begin)[0]
+        x, _, _, square, _ = jax.lax.while_loop(unfinished, again, begin)
+        return jnp.where(square <= tolerable * first, x, jnp.nan)
 
     found: Parameters = jax.lax.custom_linear_solve(times, right, solve, symmetric=True, transpose_solve=solve)
     return found

@@ -13,7 +13,11 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from ..spelling import did_you_mean
 from .searches import BoundedDescent, DampingSearch, Parameters, Quadratic, Scalar, normal_equations
+
+OPTIONS = frozenset({"lower", "upper", "curvature", "quadratic", "aim", "outlook", "state"})
+"""Names of the options of `LevenbergMarquardt`."""
 
 
 class LeastSquaresState(eqx.Module):
@@ -74,6 +78,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Parameters, Any, Any, L
     | aim, outlook | given up after `patience` steps where the objective is above ``aim``, and would be     |
     |              | after ``outlook`` falls as the last step promised                                     |
     | state        | of a fit that is to go on                                                            |
+
+    Raises:
+        ValueError: when a fit begins, if an option has another name, or bounds are given to a descent without bounds.
     """
 
     rtol: float
@@ -96,6 +103,8 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Parameters, Any, Any, L
         tags: frozenset[object],
     ) -> LeastSquaresState:
         """Nothing is known yet: the first step evaluates `y` itself."""
+        for unknown in options.keys() - OPTIONS:
+            raise ValueError(f"no option {unknown!r}; {did_you_mean(unknown, OPTIONS, f'known: {sorted(OPTIONS)}')}")
         if "state" in options:
             state: LeastSquaresState = options["state"]
             return state

@@ -10,6 +10,7 @@ import pytest
 
 from jaxeit.contacts.fit import SOLVER, TRIAL_STEPS
 from jaxeit.least_squares import BoundedDescent, Cholesky, ImplicitStep, LevenbergMarquardt, normal_equations
+from jaxeit.least_squares.adjoint import conjugate_gradients
 from jaxeit.least_squares.searches import inverse_scale, normal_inverse
 
 ALIKE = jnp.array([[1.0, 0.9], [0.0, 0.5], [0.3, 0.3]])
@@ -161,3 +162,23 @@ def test_bounds_are_refused_by_a_descent_that_knows_none():
     solver = LevenbergMarquardt(1e-10, 1e-10, descent=optx.NewtonDescent(linear_solver=Cholesky()))
     with pytest.raises(ValueError, match="NewtonDescent knows no bounds"):
         best(DATA, jnp.zeros(2), solver)
+
+
+def test_an_option_of_another_name_is_refused():
+    with pytest.raises(ValueError, match=r"no option 'lowr'; did you mean 'lower'\?"):
+        fitted(ALIKE.__matmul__, jnp.ones(3), jnp.ones(2), lowr=jnp.zeros(2))
+
+
+def test_conjugate_gradients_solve_what_is_well_conditioned():
+    matrix = jnp.diag(jnp.geomspace(1, 100, 30)) + 0.1
+    right = jnp.sin(jnp.arange(30.0))
+    found = jax.jit(partial(conjugate_gradients, matrix.__matmul__, near_inverse=lambda v: v / jnp.diagonal(matrix)))(
+        right
+    )
+    np.testing.assert_allclose(found, jnp.linalg.solve(matrix, right), rtol=1e-8)
+    np.testing.assert_array_equal(conjugate_gradients(matrix.__matmul__, jnp.zeros(30), lambda v: v), 0)
+
+
+def test_conjugate_gradients_that_do_not_end_give_no_number():
+    stiff = jnp.geomspace(1, 1e8, 400)
+    assert np.isnan(conjugate_gradients(lambda v: stiff * v, jnp.ones(400), lambda v: v)).all()
