@@ -13,6 +13,7 @@ from jaxeit.imaging import (
     AbstractIterativeMethod,
     AbstractLinearMethod,
     AbstractPenalty,
+    ConvergenceError,
     IterativeReconstructor,
     ReferenceFit,
     ReferenceSettings,
@@ -236,10 +237,10 @@ def _correlated(tank: Tank, model: je.Model, frame: np.ndarray, number: int) -> 
 
 def _fitted(tank: Tank, model: je.Model, frame: np.ndarray, number: int, fit: ReferenceSettings) -> ReferenceFit:
     """The conductivity and contacts of a frame; refuses what the fit does not find."""
-    found = fit_reference(model, frame, fit)
-    if not np.isfinite(found.value.level):
+    try:
+        return fit_reference(model, frame, fit)
+    except ConvergenceError:
         raise TankError(
             f"{tank.skin.name}: the fit of conductivity and contacts to frame {number} does not converge, as where "
             "contacts are better than the mesh resolves; leave out --fit-contacts (fit=None)"
-        )
-    return found
+        ) from None

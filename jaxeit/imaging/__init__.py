@@ -81,7 +81,7 @@ from .methods import (
     SparseBayes,
     TruncatedSvd,
 )
-from .noise import InverseError, noise_covariance
+from .noise import ConvergenceError, InverseError, noise_covariance
 from .preparation import prepare
 from .priors import (
     PRIORS,
@@ -127,6 +127,7 @@ __all__ = [
     "AbstractReconstructor",
     "BackProjection",
     "ChangeErrors",
+    "ConvergenceError",
     "CorrelatedNoise",
     "Covariance",
     "Diagonal",

@@ -22,14 +22,14 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Integer
 from scipy.linalg import block_diag
 
-from ..._compile import full_precision, verb
+from ..._compile import full_precision, is_traced, verb
 from ...effects import CommonMode, chosen
 from ...least_squares import Cholesky, ImplicitStep, LevenbergMarquardt
 from ...linalg.lapack import eigh
 from ...model.discretisation import Model, require_model
 from ...model.forward_model import forward
 from ...model.motion import Motion, electrode_motion, moved
-from ..noise import InverseError, require_real
+from ..noise import ConvergenceError, InverseError, require_real
 from .background import MAX_UNEXPLAINED, frame_error, require_explained, require_frame, sheet_level
 from .images import reading_weights
 
@@ -100,7 +100,7 @@ class ReferenceParameters(NamedTuple):
 
 
 class ReferenceFit(eqx.Module):
-    """Parameters fitted to a frame of even content; NaN throughout if the fit did not converge.
+    """Parameters fitted to a frame of even content; under jit, NaN throughout if the fit did not converge.
 
     The covariance holds what the mesh misses near electrodes on the rim, which no frame tells.
 
@@ -174,6 +174,7 @@ def fit_reference(
 
     Raises:
         InverseError: if a shape or a value is wrong, or no even content explains the frame.
+        ConvergenceError: if the fit does not converge.
         SceneError: if ``model`` is no model, such as a tank.
         MotionError: if the electrodes cannot be moved on this mesh.
     """
@@ -201,6 +202,12 @@ def fit_reference(
         used = weight / growth
         x, misfit, converged = _most_probable(problem, known, used, x)
         growth = jnp.maximum(growth * misfit, 1) if std is None else jnp.ones_like(growth)
+    if not is_traced(converged) and not converged:
+        raise ConvergenceError(
+            f"the fit to the frame does not converge in {MAX_STEPS} steps, as where contacts are better than the mesh "
+            "resolves, or in float32; use float64 (jax_enable_x64), fit fewer unknowns, or keep the contacts of the "
+            "model: contact=0 and contact_each=0"
+        )
     fit, found = _described(problem, known, used, jnp.where(converged, x, jnp.nan))
     used = jnp.where(converged, used, 0)
     hint: Callable[[], str] = str if settings.offset else partial(_with_offset, known, even, used)
