@@ -39,6 +39,10 @@ class InverseError(ValueError):
     """Settings from which no reconstruction can be made."""
 
 
+class ConvergenceError(InverseError):
+    """A fit that does not find its end."""
+
+
 class Whitening(eqx.Module):
     """The pair sums that a protocol measures, and how well.
 
@@ -229,11 +233,16 @@ class PairStructure(NamedTuple):
 
 
 def structure_of(gram: np.ndarray) -> PairStructure:
-    """The structure of G, from its Cholesky factor with pivots: as many pair sums as its rank."""
-    upper, pivots, rank, _ = dpstrf(gram, tol=1e-11 * gram.diagonal().max())
+    """The structure of G, from its Cholesky factor with pivots: as many pair sums as its rank.
+
+    G is scaled to a diagonal of one before: the rank is that of the pair sums, however unequal the noise of readings.
+    """
+    size = np.sqrt(np.where(gram.diagonal() > 0, gram.diagonal(), 1))
+    upper, pivots, rank, _ = dpstrf(gram / np.outer(size, size), tol=1e-11)
     taken, left = np.split(pivots - 1, [rank])
     mixing, null = np.empty((rank, len(gram))), np.zeros((len(gram), len(left)))
-    mixing[:, taken], mixing[:, left] = np.eye(rank), solve_triangular(upper[:rank, :rank], upper[:rank, rank:])
+    scaled = solve_triangular(upper[:rank, :rank], upper[:rank, rank:])
+    mixing[:, taken], mixing[:, left] = np.eye(rank), scaled * size[left] / size[taken, None]
     null[taken], null[left] = -mixing[:, left], np.eye(len(left))
     unit = np.zeros_like(mixing)
     unit[:, taken] = np.eye(rank)
