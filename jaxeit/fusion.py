@@ -31,7 +31,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 from numpy.typing import DTypeLike
 
-from ._compile import full_precision, is_traced, require_known
+from ._compile import is_traced, require_known, verb
 from .kinds import is_number, require_kind, shown
 from .linalg.array_libraries import real_array
 from .model.bases import AbstractPictured, overlap_areas
@@ -202,8 +202,7 @@ MIN_PART_ON_PAD = 0.05
 LOG_OF_ZERO = -1e30
 
 
-@eqx.filter_jit
-@full_precision
+@verb
 def contact_shares(
     position: Float[Array, "... K 2"],
     width: Float[Array, "... K"],
@@ -304,8 +303,7 @@ def require_gate(gate: Float[ArrayLike, ""]) -> None:
         raise FusionError(f"gate is {shown(gate)}; give the smallest concentration of a valid image, 0.5 to 1")
 
 
-@eqx.filter_jit
-@full_precision
+@verb
 def _fused(
     image: Float[Array, "... pixels"],
     masks: PadMasks,

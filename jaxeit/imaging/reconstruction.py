@@ -161,6 +161,11 @@ def _imaged(
     return recon._image(recon.whitening.sums(dv) if whole else recon._sums(dv))
 
 
+@verb
+def _matrix(factor: Float[Array, "basis k"], whitening: Whitening, readings: int) -> Float[Array, "basis readings"]:
+    return factor @ whitening.sums(jnp.eye(readings, dtype=factor.dtype)).T
+
+
 class Reconstructor(AbstractReconstructor):
     """A linear reconstruction, ``image = Q dv``, kept as ``Q = factor P^T W`` (see `noise`).
 
@@ -201,7 +206,7 @@ class Reconstructor(AbstractReconstructor):
     @property
     def matrix(self) -> Float[Array, "basis readings"]:
         """Q as one matrix, (basis, readings) S/V; a reconstructor is applied without it."""
-        return self.factor @ self.whitening.sums(jnp.eye(self.readings, dtype=self.factor.dtype)).T
+        return _matrix(self.factor, self.whitening, self.readings)
 
     def on_host(
         self, dtype: str | None = None

@@ -230,10 +230,7 @@ class _Search:
             jac=True,
             method="SLSQP",
             bounds=[(-1.0, 1.0)] * here.size,
-            constraints={
-                "type": "ineq",
-                "fun": lambda u: _slack(self.skin, self.limits, self.home, here + shift(u)) / size,
-            },
+            constraints={"type": "ineq", "fun": slack},
             options={"maxiter": ITERATIONS, "ftol": TOLERANCE},
         )
         skin = with_positions(self.skin, here + shift(found.x))

@@ -15,7 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Integer
 
-from .._compile import full_precision, is_traced, require_known
+from .._compile import is_traced, require_known, verb
 from ..kinds import is_number, require_kind, shown
 from ..linalg.array_libraries import real_array
 from ..skin.protocol import Protocol, ProtocolError
@@ -146,8 +146,7 @@ def drives(pattern: Integer[ArrayLike, "readings 4"]) -> Int[np.ndarray, " readi
     return np.asarray(np.unique(np.asarray(pattern)[:, :2], axis=0, return_inverse=True)[1]).ravel()
 
 
-@eqx.filter_jit
-@full_precision
+@verb
 def _chosen(
     selection: AbstractSelection,
     signal: Float[Array, "readings readings"],

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float
+from scipy.spatial import cKDTree
 
 from ..._compile import full_precision, verb
 from ...model.discretisation import Model
@@ -171,7 +172,7 @@ def _atoms(sheet: PressedSheet, rows: Float[Array, "b 4"]) -> Float[Array, "b r"
 
 def _reach(centroids: Float[np.ndarray, "elements 2"], radius: float) -> int:
     """Largest number of elements within a circle around one of them."""
-    return max(int((((centroids - one) ** 2).sum(1) < radius**2).sum()) for one in centroids)
+    return int(cKDTree(centroids).query_ball_point(centroids, radius, return_length=True).max())
 
 
 def field_modes(points: Float[np.ndarray, "n 2"], length: float) -> Float[np.ndarray, "n g"]:
