@@ -2,6 +2,7 @@
 
 import os
 import re
+from binascii import crc32
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,12 +11,14 @@ from typing import Any
 from ..session.errors import printable, problem
 from ..session.hdf5.storage import folder_beside, sync
 from ..session.importers.child import library
+from ..session.importers.formats.mcap_checksums import write_summary_checksum
 from .message_sink import AbstractMessageSink
 
 EXTRA = "tables"
 SUFFIX = ".mcap"
 METADATA_VERSION = 8  # of rosbag2; the older of the two that `rosbags` writes
 END_OF_TIME = 2**31 * 10**9  # ns; a stamp of ROS counts seconds in an int32
+CHUNK_CRC = 9 + 24  # bytes from a record of a chunk to its checksum: opcode, length, two times, size
 _TOKEN = r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*"
 _TOPIC, _FRAME = re.compile(rf"(/{_TOKEN})+"), re.compile(rf"{_TOKEN}(/{_TOKEN})*")
 
@@ -78,11 +81,29 @@ def writing_bag(output: Path) -> Iterator[Bag]:
         writer = rosbag2.Writer(folder, version=METADATA_VERSION, storage_plugin=plugin)
         writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
         with writer:
+            _add_chunk_checksums(writer.storage)
             yield Bag(writer, rosbag2, interfaces, store)
+        file = folder / f"{folder.name}{SUFFIX}"
+        write_summary_checksum(file)
         for path in folder.iterdir():
             sync(path)
         _require_free(output)
-        os.rename(folder / f"{folder.name}{SUFFIX}" if output.suffix == SUFFIX else folder, output)
+        os.rename(file if output.suffix == SUFFIX else folder, output)
+
+
+def _add_chunk_checksums(storage: Any) -> None:
+    """Make an open storage of rosbags, which leaves out checksums, write that of each chunk of messages."""
+    close = storage.close_chunk
+
+    def close_chunk() -> None:
+        start, checksum = storage.bio.tell(), crc32(storage.chunk.bio.getvalue())
+        close()
+        end = storage.bio.tell()
+        storage.bio.seek(start + CHUNK_CRC)
+        storage.bio.write(checksum.to_bytes(4, "little"))
+        storage.bio.seek(end)
+
+    storage.close_chunk = close_chunk
 
 
 def _require_free(output: Path) -> None:

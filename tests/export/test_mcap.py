@@ -1,5 +1,6 @@
 """Bags of ROS 2 hold the numbers of the force map and of the session, as two readers that are not ours read them."""
 
+import json
 import sys
 from dataclasses import replace
 from datetime import datetime
@@ -15,6 +16,7 @@ from calib.cli import main
 from calib.export.mcap_messages import turn_to
 from calib.export.mcap_writer import topic_names
 from calib.session import ArchiveWriter, SessionFacts, SessionWriter, Status, StreamFacts
+from calib.session.importers import McapImporter, child
 from jaxeit.geometry import Cylinder, Sphere
 
 highlevel = pytest.importorskip("rosbags.highlevel")
@@ -223,6 +225,54 @@ def test_a_session_comes_back_by_import(tmp_path):
                 np.testing.assert_array_equal(back.streams[name].read(), values[name])
                 times = back.epoch_ns + back.streams[name].time
                 np.testing.assert_allclose(times - EPOCH_NS, stream.time, rtol=0, atol=500)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """The bytes of an exported session of two chunks, and its values."""
+    folder = tmp_path_factory.mktemp("exported")
+    time, values = np.arange(140) * 10**7, np.random.default_rng(3).normal(size=(140, 1000))
+    with SessionWriter(folder / "s.h5", SessionFacts(epoch=datetime.fromisoformat(EPOCH))) as writer:
+        writer.add_stream("eit", StreamFacts("voltage", "V", 1000, 100, dtype="f8"))
+        writer.append("eit", time, values)
+    calib.export_mcap(folder / "s.h5", folder / "s.mcap")
+    return (folder / "s.mcap").read_bytes(), values
+
+
+def test_import_refuses_an_export_with_a_flipped_bit(exported, tmp_path):
+    """A flip in messages or summary is refused. Others lie where the reader does not look, as the index of chunks."""
+    good, values = exported
+    path, names = tmp_path / "s.mcap", ["/skin/eit.data"]
+    request = {"module": McapImporter.__module__, "reader": "McapImporter", "task": "arrays", "names": names}
+    request = json.dumps(request | {"path": str(path), "folder": str(tmp_path)})
+
+    def refused(place):
+        path.write_bytes(good[:place] + bytes([good[place] ^ 0x10]) + good[place + 1 :])
+        status, said = child.answer(request)
+        assert not status or (status == child.BAD_FILE and "the file is damaged" in said), said
+        np.testing.assert_array_equal(values, values if status else np.load(tmp_path / "0.npy"))
+        return bool(status)
+
+    path.write_bytes(good)
+    assert child.answer(request) == (0, "null")
+    assert sum(map(refused, np.random.default_rng(4).integers(0, len(good), 50).tolist())) > 45
+    summary = int.from_bytes(good[-28:-20], "little")
+    assert all(map(refused, range(summary, len(good), 20)))
+
+
+def test_every_chunk_of_an_export_has_a_checksum(exported, tmp_path):
+    stream = pytest.importorskip("mcap.stream_reader")
+    (tmp_path / "s.mcap").write_bytes(exported[0])
+    with open(tmp_path / "s.mcap", "rb") as file:
+        records = list(stream.StreamReader(file, emit_chunks=True).records)
+    chunks = [one for one in records if type(one).__name__ == "Chunk"]
+    assert len(chunks) > 1
+    assert all(one.uncompressed_crc for one in chunks)
+    assert sum(one.summary_crc > 0 for one in records if type(one).__name__ == "Footer") == 1
+    with open(tmp_path / "s.mcap", "rb") as file:
+        assert (
+            sum(type(one).__name__ == "Message" for one in stream.StreamReader(file, validate_crcs=True).records) == 140
+        )
 
 
 def test_what_cannot_be_exported_ends_in_one_line(bag, arrays, tmp_path, capsys):

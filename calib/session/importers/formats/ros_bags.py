@@ -18,6 +18,7 @@ from ..child import library
 from ..columns import FileSpec
 from ..limits import MAX_NAMES, check_size
 from ..tables import first_bytes
+from .mcap_checksums import require_summary
 
 EXTRA = "tables"
 LOG_TIME = "log_time"
@@ -91,8 +92,15 @@ def _opened(path: Path) -> Iterator[Any]:
         first_bytes(path)
     highlevel, typesys = library("rosbags.highlevel", EXTRA), library("rosbags.typesys", EXTRA)
     store = typesys.get_typestore(typesys.Stores.LATEST)
+    for file in _mcap_files(path):
+        require_summary(file)
     with highlevel.AnyReader([path], default_typestore=store) as bag:
         yield bag
+
+
+def _mcap_files(path: Path) -> list[Path]:
+    """The MCAP files of a recording: those in its folder, or the file itself."""
+    return [file for file in (sorted(path.iterdir()) if path.is_dir() else [path]) if file.suffix == ".mcap"]
 
 
 def _topics(path: Path, bag: Any) -> dict[str, list[Any]]:
