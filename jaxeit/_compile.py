@@ -94,6 +94,8 @@ def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | N
     forward solution of a small model. Small arrays are packed into one array of each type. Parts of ``first`` that are
     no arrays are static, as for `verb`. Where ``first`` differs in its numbers only, nothing is compiled anew.
 
+    Works under jit, vmap and grad, where it becomes part of the transformed function and has no options of its own.
+
     Args:
         options: for XLA; default: `compiler_options`.
 
@@ -108,11 +110,13 @@ def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | N
     flags = tuple(sorted((compiler_options() if options is None else options).items()))
     others, form = jax.tree.flatten(static)
     typed = tuple((type(leaf), leaf) for leaf in others)  # 1 is no 1.0
-    program = _bound(function, structure, layout, typed, form, flags, None)
+    key = function, structure, layout, typed, form
+    inner = _bound(*key, (), None)  # JAX takes options for whole programs only
     if programs_folder() is None:
-        return lambda *rest: program(packs, rest)
-    kept = _bound(function, structure, layout, typed, form, flags, changes_of_folder())
-    return lambda *rest: program(packs, rest) if _is_transformed(rest) else unbound(kept(packs, rest))
+        outer = _bound(*key, flags, None)
+        return lambda *rest: (inner if _is_transformed(rest) else outer)(packs, rest)
+    kept = _bound(*key, flags, changes_of_folder())
+    return lambda *rest: inner(packs, rest) if _is_transformed(rest) else unbound(kept(packs, rest))
 
 
 @lru_cache(maxsize=256)

@@ -39,6 +39,24 @@ def test_a_verb_is_the_same_wherever_it_is_called(around, first_call):
     assert float(around(double)(jnp.ones(1))[0]) == 2.0
 
 
+@pytest.mark.parametrize(
+    "around",
+    [
+        lambda f: f,
+        jax.jit,
+        jax.vmap,
+        lambda f: jax.jit(jax.vmap(f)),
+        lambda f: lambda x: 2 * jax.grad(lambda y: f(y).sum())(x) - 4 + f(x),
+        lambda f: lambda x: jax.lax.scan(lambda carried, _: (carried, f(carried)), x, None, 2)[1][1],
+    ],
+    ids=["alone", "jit", "vmap", "jit of vmap", "grad", "scan"],
+)
+def test_a_bound_function_is_the_same_wherever_it_is_called(around, first_call):
+    """Options are for whole programs only."""
+    bound = je.bind(lambda scale, x: scale * x, jnp.asarray(2.0))
+    assert float(around(bound)(jnp.ones(1))[0]) == 2.0
+
+
 def test_a_verb_of_constants_inside_a_program(first_call):
     """No argument tells that a program is being made; options are for whole programs only."""
     constant = jnp.ones(3)
