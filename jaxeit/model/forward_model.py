@@ -159,6 +159,7 @@ def conductivity(
         pressure: on the sheet, (elements,) Pa; default: none.
         temperature: above that at which the skin's sheet resistance was measured, K.
     """
+    _require_values(model, "background", model.background)
     if not chosen(model.effects, AbstractSheetEffect):
         return model.background  # no effect changes it: the program is that of the ideal sensor
     return _conductivity(model, pressure, temperature)
@@ -209,16 +210,22 @@ def coefficients(model: Model, sigma: Float[Array, " elements"] | CoatedSheet | 
 
 
 def _checked_values(model: Model, name: str, values: Float[Array, " elements"]) -> Float[Array, " elements"]:
-    if values.shape != model.background.shape or values.dtype != model.dtype:
-        batch = values.ndim > 1 and values.shape[-1:] == model.background.shape
-        cast = values.shape == model.background.shape
+    _require_values(model, name, values)
+    # With small negative values the matrix remains positive definite, and the voltages would look valid.
+    return jnp.where(values < 0, jnp.nan, values)
+
+
+def _require_values(model: Model, name: str, values: Float[Array, "..."]) -> None:
+    """Raise ValueError unless there is one value for each element, in the model's precision."""
+    needed = model.areas.shape
+    if values.shape != needed or values.dtype != model.dtype:
+        batch = values.ndim > 1 and values.shape[-1:] == needed
+        cast = values.shape == needed
         hint = "; use jax.vmap for a batch" if batch else "; use .astype(model.dtype)" if cast else ""
         raise ValueError(
             f"{name} is {values.dtype}{list(values.shape)}; this model needs "
-            f"{model.dtype}{list(model.background.shape)}, one value per element{hint}"
+            f"{model.dtype}{list(needed)}, one value per element{hint}"
         )
-    # With small negative values the matrix remains positive definite, and the voltages would look valid.
-    return jnp.where(values < 0, jnp.nan, values)
 
 
 def readings(model: Model, z: Float[Array, "electrodes electrodes"]) -> Float[Array, " readings"]:

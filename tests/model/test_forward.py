@@ -270,6 +270,11 @@ def test_wrong_sigma_is_refused(model):
         je.forward(model, model.background.astype(jnp.float32))
     with pytest.raises(ValueError, match=r"; use jax\.vmap for a batch"):
         je.forward(model, jnp.stack([model.background] * 2))
+    short = eqx.tree_at(lambda m: m.background, model, model.background[:3])
+    with pytest.raises(ValueError, match=r"^background is float64\[3\]; this model needs float64\[\d+\]"):
+        je.forward(short)
+    with pytest.raises(ValueError, match=r"^sigma is .*one value per element"):
+        je.forward(short, short.background)
 
 
 def test_float64_without_x64_is_refused(skin):
