@@ -141,7 +141,7 @@ def prepare(
     about = Provenance({"jaxeit": _VERSION, **settings, "rank": _rank(found, followed), **(provenance or {})})
     # Inside jit, what is known stays known.
     recon = replace(recon, whitening=found.whitening, picture=image.picture, provenance=about)
-    _require_finite(recon)
+    _require_finite(recon, prior)
     return recon if isinstance(method, AbstractLinearMethod) else _iterative(method, problem, compress, recon)
 
 
@@ -255,11 +255,11 @@ def check_range(hyperparameter: Any, method: Any, dtype: np.dtype) -> None:
         )
 
 
-def _require_finite(recon: Reconstructor) -> None:
+def _require_finite(recon: Reconstructor, prior: AbstractPrior) -> None:
     if not is_traced(recon.factor) and not np.isfinite(recon.factor).all():
         raise InverseError(
-            "the reconstruction matrix is not finite: the conductivity must be positive, and the noise, in V, within "
-            f"the range of {recon.factor.dtype}"
+            f"the reconstruction matrix is not finite: the conductivity and the precision of the prior "
+            f"{type(prior).__name__} must be positive, and the noise, in V, within the range of {recon.factor.dtype}"
         )
 
 

@@ -3,9 +3,12 @@
 import dataclasses
 from dataclasses import dataclass
 
+import equinox as eqx
 import numpy as np
+from jax.tree_util import keystr, tree_flatten_with_path
 
 from ..effects import EFFECTS, AbstractEffect
+from ..kinds import stated
 from ..skin.description import Skin
 from ..toml import TomlTable
 
@@ -22,7 +25,8 @@ class Scene:
 
     Raises:
         SceneError: if ``skin`` is not a `Skin`; if ``effects`` is not a tuple of effects; if two of them are
-            alternatives; if one names an electrode that the skin does not have.
+            alternatives; if one holds anything but numbers in a field that is not static; if one names an electrode
+            that the skin does not have.
     """
 
     skin: Skin
@@ -36,8 +40,21 @@ class Scene:
         for effect in self.effects:
             if not isinstance(effect, AbstractEffect):
                 raise SceneError(f"{effect!r} is not an effect; make one, such as jaxeit.effects.LoadSpreading()")
+        _check_numbers(self.effects)
         _check_alternatives(self.effects)
         _check_electrodes(self.effects, len(self.skin.electrodes))
+
+
+def _check_numbers(effects: tuple[AbstractEffect, ...]) -> None:
+    """JAX computes with every field that is not static."""
+    for effect in effects:
+        for path, leaf in tree_flatten_with_path(effect)[0]:
+            if not eqx.is_array_like(leaf):
+                name = keystr(path).lstrip(".")
+                raise SceneError(
+                    f"{type(effect).__name__}: {name} is {stated(leaf)}, and not a number; write the field as "
+                    f"{name}: ... = equinox.field(static=True) where it is a choice"
+                )
 
 
 def _check_alternatives(effects: tuple[AbstractEffect, ...]) -> None:

@@ -339,6 +339,18 @@ def test_scenes_refuse_what_is_not_an_effect(skin):
         je.Scene(skin, effects=(je.effects.ElectrodeFault(electrode=25),))
 
 
+class Labelled(je.effects.AbstractSheetEffect):
+    label: str
+
+    def __call__(self, sheet):
+        return sheet
+
+
+def test_a_field_that_jax_cannot_compute_with_is_named(skin):
+    with pytest.raises(je.model.SceneError, match=r"Labelled: label is 'dry', and not a number; write the field as"):
+        je.Scene(skin, effects=(Labelled("dry"),))
+
+
 @pytest.mark.parametrize(
     ("table", "message"),
     [

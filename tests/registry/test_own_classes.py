@@ -178,6 +178,30 @@ def test_a_prior_and_a_method(own, model):
     assert bool(jnp.isfinite(recon(jnp.full(len(model.pattern), 1e-3))).all())
 
 
+class Stated(je.AbstractPrior):
+    """R = diag(values)."""
+
+    values: tuple[float, ...]
+
+    def precision(self, jacobian, picture, at=None):
+        return je.imaging.Diagonal(
+            jnp.asarray(self.values) * jnp.ones(jacobian.shape[1] if len(self.values) == 1 else 1)
+        )
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ((np.nan,), "the precision of the prior Stated must be positive"),
+        ((-1.0,), "the precision of the prior Stated must be positive"),
+        ((1.0,) * 7, r"Stated.precision returns Diagonal of 7 values; the image has \d+"),
+    ],
+)
+def test_a_prior_that_cannot_be_is_named(model, values, message):
+    with pytest.raises(je.imaging.InverseError, match=message):
+        je.prepare(model, Stated(values), basis=je.Pixels(8).on(model))
+
+
 def test_an_electrode_in_a_skin_file(own, tmp_path):
     text = je.load_skin("testbed").toml
     start, stop = text.index("[electrodes]"), text.index("[protocol]")

@@ -33,10 +33,15 @@ class Problem(eqx.Module):
     def precision(self, at: Float[Array, " basis"] | None = None) -> AbstractPrecision:
         """R; see `AbstractPrior.precision`."""
         found = self.prior.precision(self.jacobian, self.picture, at)
+        returns = f"{type(self.prior).__name__}.precision returns"
         if not isinstance(found, AbstractPrecision):
             given = "an array" if hasattr(found, "shape") else type(found).__name__
-            wanted = "jaxeit.imaging.Diagonal(values), or Precision(matrix)"
-            raise InverseError(f"{type(self.prior).__name__}.precision returns {given}; return {wanted}")
+            raise InverseError(f"{returns} {given}; return jaxeit.imaging.Diagonal(values), or Precision(matrix)")
+        size = len(getattr(found, "values", self.picture.areas))
+        if size != len(self.picture.areas):
+            raise InverseError(
+                f"{returns} {type(found).__name__} of {size} values; the image has {len(self.picture.areas)}"
+            )
         return found
 
     def strength(self, gained: Float[Array, "basis k"]) -> Float[Array, ""]:
