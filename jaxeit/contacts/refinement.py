@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from .._compile import require_known, verb
-from ..imaging.noise import InverseError, Whitening, whitened_readings
+from ..imaging.noise import InverseError, Whitening, require_real, whitened_readings
 from ..least_squares import ImplicitStep
 from ..least_squares.searches import normal_inverse
 from ..model.discretisation import Model
@@ -44,6 +44,7 @@ def refine_contacts(
         InverseError: if shapes do not fit, or a reading that is used is not finite.
     """
     require_known("refine_contacts", InverseError, model, dv, contacts, noise, sigma, channels)
+    require_real(dv=dv)
     found = whitened_readings(model, noise, channels)
     readings, dv, used = model.readings, np.asarray(dv, float), np.asarray(found.whitening.channels)
     if dv.shape != (readings,) or contacts.present.ndim != 1:

@@ -118,9 +118,8 @@ class ContactFinder(eqx.Module):
         finder. Other devices search `SIDE_BY_SIDE` frames at a time, and ``jax.vmap`` all of them, each of which takes
         some 30 MB.
         """
-        frames = jnp.asarray(dv, self.compress.dtype)
-        require_frames(frames, self.readings)
-        return _find(self, frames)
+        require_frames(dv, self.readings)
+        return _find(self, jnp.asarray(dv, self.compress.dtype))
 
     @property
     def readings(self) -> int:

@@ -289,6 +289,15 @@ def test_frames_of_another_length_are_refused(finder):
         finder(np.zeros(549))
 
 
+def test_complex_frames_are_refused(finder, model):
+    """JAX would leave out their imaginary part with a warning."""
+    frame = 1j * np.ones(finder.readings)
+    none = finder(np.zeros(finder.readings))
+    for call in (finder, lambda dv: je.contacts.refine_contacts(model, dv, none, noise=1e-6)):
+        with pytest.raises(je.imaging.InverseError, match="dv is complex, and a model is real"):
+            call(frame)
+
+
 @pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.slow)])
 def test_where_one_start_ends_badly_the_other_is_finished(finder, linear, every):
     """Of pairs near a corner a fifth end in a wrong minimum, up to 18 times the noise, if only one start goes on."""

@@ -22,7 +22,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..._compile import require_known
-from ...imaging.noise import InverseError, Whitening
+from ...imaging.noise import InverseError, Whitening, require_real
 from ..result import Contacts
 from .comparison import FORMS, Comparison, free_parameters
 from .programs import white
@@ -103,6 +103,7 @@ class LoadFitter(eqx.Module):
 
     def whitened(self, dv: Float[ArrayLike, " readings"], batch: int) -> np.ndarray:
         """The whitened readings of one frame."""
+        require_real(dv=dv)
         dv, used = np.asarray(dv, float), np.asarray(self.whitening.channels)
         if dv.shape != used.shape or batch:
             raise InverseError(f"dv has shape {dv.shape}; fit one frame of {len(used)} readings at a time")
