@@ -15,9 +15,11 @@ from calib.fitting.curves import (
     Play,
     PlaySpline,
     PowerLaw,
+    fit_curves,
 )
 from calib.fitting.curves.base import Scale, resistant_line, scale_of
 from calib.fitting.curves.play_operators import play
+from calib.fitting.results import FitError
 
 CASES = [
     (Linear(), [4e-3]),
@@ -188,3 +190,74 @@ def test_hysteresis_is_undone_by_its_inverse_on_any_way(curve, params):
     rising = np.interp(level, pressure[1:40][up[:39]], force[1:40][up[:39]])
     falling = np.interp(level, pressure[25:70][down[24:69]][::-1], force[25:70][down[24:69]][::-1])
     assert abs(rising - falling) > 0.1
+
+
+class WrongShape(Linear):
+    def __call__(self, params, pressure):
+        return jnp.ones(3)
+
+
+class NotFinite(Linear):
+    def __call__(self, params, pressure):
+        return params[0] * jnp.sqrt(pressure - 100.0)
+
+
+class Falling(Linear):
+    def __call__(self, params, pressure):
+        return -params[0] * pressure
+
+
+class Nothing(Linear):
+    def inverse(self, params, force):
+        return None
+
+
+class NotInverted(Linear):
+    def inverse(self, params, force):
+        return jnp.log(-force)
+
+
+@pytest.mark.parametrize(
+    ("curve", "said"),
+    [
+        (WrongShape(), r"^WrongShape\.__call__ returns a result of shape \(3,\) .*; return one number for each"),
+        (
+            NotFinite(),
+            r"^NotFinite\.__call__ returns nan N at 50 Pa, with slope = .* N/Pa, .* to pad 0; return a finite",
+        ),
+        (
+            Falling(),
+            r"^Falling\.__call__ falls from -.* N at .* Pa to -.* N at .* Pa, .* to pad 0; a curve must rise",
+        ),
+        (Nothing(), r"^Nothing\.inverse returns a result of type NoneType"),
+        (
+            NotInverted(),
+            r"^NotInverted\.inverse returns nan Pa at .* N, the force at 50 Pa, with .* to pad 0; return the",
+        ),
+    ],
+)
+def test_a_curve_of_a_users_own_is_named_with_its_method(curve, said):
+    pressure = np.stack([np.linspace(50, 4000, 30), np.full(30, np.nan)])
+    with pytest.raises(FitError, match=said):
+        fit_curves(curve, pressure, 2e-3 * pressure)
+
+
+class TurnsDown(Linear):
+    """Rises at the start of a fit, and falls where the samples do."""
+
+    def bound(self, free, scale):
+        return free * scale.force / scale.pressure
+
+    def free(self, params, scale):
+        return params * scale.pressure / scale.force
+
+    @property
+    def positive(self):
+        return np.array([False])
+
+
+def test_the_message_of_a_fit_names_a_curve_of_a_users_own():
+    pressure = np.linspace(10, 4000, 30)
+    falling = fit_curves(TurnsDown(), pressure[None], -2e-3 * pressure).pad(0)
+    assert falling.message().endswith("at more load levels; or TurnsDown.__call__ falls or is not finite")
+    assert "PowerLaw" not in fit_curves(PowerLaw(), pressure[None], -2e-3 * pressure).pad(0).message()

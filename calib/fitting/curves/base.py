@@ -93,7 +93,8 @@ class AbstractCurve(AbstractChoice):
 
     Subclasses state `names` and `units` of their parameters, in order. A curve with `path` = True has memory: it gives
     the force at each pressure of a time series, which depends on the pressures before. Other curves are functions of
-    the present pressure alone.
+    the present pressure alone. The fit refuses a curve of a user's own that falls, is not finite, or does not return
+    one number for each.
     """
 
     names: ClassVar[tuple[str, ...]]

@@ -41,6 +41,7 @@ from ..results import FitError, FitResult
 from .base import AbstractCurve, scale_of
 from .covariance import CurveCovariance, CurveMinimum, covariance_at
 from .fitted import FittedCurve
+from .own_curves import Trial, is_own, require_sound, trial
 from .problem import CurveProblem
 from .samples import Numbers, Samples, bucket, gather
 
@@ -228,6 +229,16 @@ def _fit_pads(
     return found
 
 
+@je.verb
+def _try_pads(curve: AbstractCurve, samples: Samples, loss: AbstractLoss) -> Trial:
+    def one(samples: Samples) -> Trial:
+        used, problem, _ = _prepare(curve, samples, loss, 0)
+        return trial(problem, _pressure_range(used))
+
+    tried: Trial = eqx.filter_vmap(one)(samples)
+    return tried
+
+
 def fit_curves(
     curve: AbstractCurve,
     pressures: Numbers,
@@ -260,7 +271,8 @@ def fit_curves(
         pads.
 
     Raises:
-        FitError: for shapes that do not fit together, or sigma not above zero.
+        FitError: for shapes that do not fit together, sigma not above zero, or a curve of a user's own that is not
+            finite or falls.
 
     Example:
         for loss in (fitting.Squared(), fitting.SoftL1(), fitting.Cauchy()):  # names: fitting.LOSSES
@@ -272,6 +284,8 @@ def fit_curves(
     samples, n_groups = gather(pressures, forces, mask=mask, groups=groups, sigma=sigma, dtype=dtype, length=length)
     loss = SoftL1() if loss is None else loss
     solver = default_solver(samples.pressure.dtype) if solver is None else solver
+    if is_own(curve):
+        require_sound(curve, _try_pads(curve, samples, loss))
     return _fit_pads(curve, samples, loss, solver, bucket(n_groups) if n_groups else 0, max_steps, ROUNDS)
 
 

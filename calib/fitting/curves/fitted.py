@@ -12,6 +12,7 @@ import jaxeit as je
 
 from ..results import FitResult
 from .base import AbstractCurve
+from .own_curves import is_own
 
 # Part of the fitted range of pressures by which a pressure beyond it still counts as calibrated.
 RANGE_TOLERANCE = 0.05
@@ -66,7 +67,10 @@ class FittedCurve(eqx.Module):
 
     def message(self) -> str:
         """The outcome of the fit in one sentence, and what to do about it (one pad)."""
-        return FitResult(int(self.result)).message
+        said = FitResult(int(self.result)).message
+        if is_own(self.curve) and int(self.result) in (FitResult.NOT_FINITE, FitResult.NO_RESPONSE):
+            return f"{said}; or {type(self.curve).__name__}.__call__ falls or is not finite"
+        return said
 
     def predict(self, pressure: Real[ArrayLike, "..."], tolerance: float = RANGE_TOLERANCE) -> Prediction:
         """Force of one pad at `pressure` (any shape, Pa); by the delta method, se^2 = g' C g with g = dh/dparameters.
