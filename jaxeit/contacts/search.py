@@ -68,7 +68,7 @@ Tried = tuple[Int[Array, ""] | int, ContactFit]
 class ContactFinder(eqx.Module):
     """Frames to contacts, without mesh or solver; from `prepare_contacts`.
 
-    The names of the fields are those in calibration files.
+    It holds numbers alone: no mesh and no solver. The names of the fields are those in calibration files.
 
     | meaning                                                                   | shape        | unit  |
     |---------------------------------------------------------------------------|--------------|-------|
@@ -86,7 +86,9 @@ class ContactFinder(eqx.Module):
     | most: contacts looked for, K                                              |              |       |
 
     Example:
-        quick = jax.jit(finder)  # a finder holds numbers alone: no mesh, no solver
+        # a step of a program of yours; jax.jit(finder) itself has arrays that JAX cannot hash
+        strongest = jax.jit(lambda dv: finder(dv).amplitude.max())
+        print(strongest(dv))  # S
         several = jax.vmap(finder)(jnp.stack([dv, 2 * dv]))  # frames along a leading axis
     """
 

@@ -176,7 +176,7 @@ class Reconstructor(AbstractReconstructor):
     | the rest: `AbstractReconstructor`                                                |            |      |
 
     A call is compiled already. As a step of a compiled function of your own it stands in that function, as below:
-    ``jax.jit(recon)`` itself has no arrays that JAX could compare.
+    ``jax.jit(recon)`` itself has arrays that JAX cannot hash.
 
     Example:
         strongest = jax.jit(lambda dv: jnp.max(recon(dv)))
