@@ -277,10 +277,7 @@ def _rows(calibration: Calibration, epoch: str) -> dict[str, tuple[tuple[str, ..
 
 
 def _of_block(time: np.ndarray, found: ForceEstimate, multiple: float) -> dict[str, np.ndarray]:
-    """Rows under the names of `_rows`; half the 90 % interval is a multiple of the standard error.
-
-    Errors of different pads count as independent.
-    """
+    """Rows under the names of `_rows`; half the 90 % interval is a multiple of the standard error."""
     parts = {
         "time": time,
         "force": found.map.force,
@@ -289,7 +286,7 @@ def _of_block(time: np.ndarray, found: ForceEstimate, multiple: float) -> dict[s
         "pad_force_se": found.standard_error,
         "pad_force_half": multiple * found.standard_error,
         "total_force": found.force.sum(1),
-        "total_force_half": multiple * np.sqrt((found.standard_error**2).sum(1)),
+        "total_force_half": multiple * found.total_error,
         "pad_valid": found.valid,
         "shape_valid": found.map.valid,
         "contact_position": found.position,

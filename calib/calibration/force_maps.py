@@ -35,6 +35,7 @@ class ForceEstimate(NamedTuple):
     | valid: pressure within the calibrated range                              | (n, pads)    |      |
     | position of each contact found; NaN: none                                | (n, K, 2)    | m    |
     | contact_force: its shares of the forces on pads that it lies on          | (n, K)       | N    |
+    | total_error: standard error of one reading of the sum over the pads      | (n,)         | N    |
 
     Contacts are found by a calibration with a correction by location; otherwise K is 0. The force of a pad is divided
     among contacts by the parts of their fitted bumps on the pad. Forces of pads without a contact are noise or
@@ -52,6 +53,7 @@ class ForceEstimate(NamedTuple):
     valid: Any
     position: Any
     contact_force: Any
+    total_error: Any
 
 
 class ForceLaw(eqx.Module):
@@ -155,7 +157,7 @@ def fused(
     gate: float,
 ) -> ForceEstimate:
     """`force_map` from known images and places (None: places are not estimated); pure."""
-    force, error, valid = law.pads.single(pressures, places, before)
+    force, error, valid, variance = law.pads.single(pressures, places, before)
     numbers, shares = (part.astype(image.dtype) for part in (force, error)), None
     if places is None:
         places = nowhere(pressures, 0)
@@ -163,7 +165,8 @@ def fused(
         shares = je.fusion.contact_shares(places.position, places.width, places.amplitude, law.recon.centres, law.masks)
     pad_force, pad_error = numbers
     found = je.fuse(image, law.masks, pad_force, gate=gate, contacts=shares, pad_errors=pad_error)
-    return ForceEstimate(found, force, error, valid, places.position, _of_contacts(force, places, shares))
+    of_contacts = _of_contacts(force, places, shares)
+    return ForceEstimate(found, force, error, valid, places.position, of_contacts, jnp.sqrt(variance))
 
 
 _fused = je.verb(fused)

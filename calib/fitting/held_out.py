@@ -76,11 +76,14 @@ def folds_by_place(place: np.ndarray, folds: int) -> np.ndarray:
 class HeldOut(NamedTuple):
     """Forces predicted by fits without the fold of the press; NaN for pads whose fit failed.
 
-    | field | meaning                                             | shape of its parts |
-    |-------|-----------------------------------------------------|--------------------|
-    | hold  | pad forces over the holds, and their errors         | (presses, pads)    |
-    | along | pad forces at all samples of the presses, likewise  | (n, pads)          |
-    | fold  | of each press                                       | (presses,)         |
+    | field | meaning                                                   | shape      |
+    |-------|-----------------------------------------------------------|------------|
+    | hold  | forces of pads over the holds, variance of their total    | (presses,) |
+    | along | the same at all samples of the presses                    | (n,)       |
+    | fold  | of each press                                             | (presses,) |
+
+    Noise laws and intervals take the variance of the total from the same rule, because the multiple of an interval is
+    a quantile of errors over it.
     """
 
     hold: PadForces
@@ -90,15 +93,15 @@ class HeldOut(NamedTuple):
     def noise(self, data: PressData, use: np.ndarray | None = None) -> NoiseLaw:
         """The noise law of the residuals at the samples of the presses `use` (presses,), by default all."""
         rows = slice(None) if use is None else use[data.sample_press]
-        force, error = (part[rows] for part in self.along)
+        force, variance = (part[rows] for part in self.along)
         residual = data.sample_force[rows] - force.sum(1)
-        return fit_noise(residual, force, (error**2).sum(1), data.sample_place[rows])
+        return fit_noise(residual, force, variance, data.sample_place[rows])
 
     def hold_noise(self, data: PressData, use: np.ndarray | None = None) -> NoiseLaw:
         """The noise law of the means over the holds of the presses `use` (presses,), by default all."""
         use = np.ones(len(data.force), bool) if use is None else use
-        force, error = (part[use] for part in self.hold)
-        return fit_noise(data.force[use] - force.sum(1), force, (error**2).sum(1), data.place[use])
+        force, variance = (part[use] for part in self.hold)
+        return fit_noise(data.force[use] - force.sum(1), force, variance, data.place[use])
 
     def half_widths(self, data: PressData, variance: np.ndarray) -> np.ndarray:
         """Half the 90 % interval of the total force over each hold, (presses,) N, by the residuals of other folds.
@@ -186,12 +189,12 @@ def joined(parts: Sequence[HeldOut], folds: Folds) -> HeldOut:
     out = HeldOut(_nothing(data.pressure.shape), _nothing(data.sample_pressure.T.shape), folds.fold)
     for part in parts:
         for mine, theirs in ((out.hold, part.hold), (out.along, part.along)):
-            _fill(mine, theirs, np.isfinite(theirs.standard_error).any(1))
+            _fill(mine, theirs, np.isfinite(theirs.force).any(1))
     return out
 
 
 def _nothing(shape: tuple[int, ...]) -> PadForces:
-    return PadForces(np.full(shape, np.nan), np.full(shape, np.nan))
+    return PadForces(np.full(shape, np.nan), np.full(shape[0], np.nan))
 
 
 def _fill(out: PadForces, found: PadForces, rows: np.ndarray) -> None:

@@ -70,9 +70,8 @@ def error_scale(folds: Folds, curve: AbstractCurve, model: PadModel, noise: Nois
 def _likeliest(folds: Folds, curve: AbstractCurve, field: AbstractField, noise: NoiseLaw, group: np.ndarray) -> float:
     """The factor of largest normal likelihood; a neighbourhood counts as one, because its presses err together."""
     data, held = folds.presses.data, folds.hold_out(curve, field)
-    force, error = held.hold
+    force, stated = held.hold
     residual, known = data.force - force.sum(1), np.asarray(noise.variance(jnp.asarray(force))).sum(1)
-    stated = (error**2).sum(1)
     sound = np.isfinite(residual) & np.isfinite(known) & np.isfinite(stated)
     if not sound.any():
         return 1.0

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .curves.fitted import Prediction
+from .pad_predictions import PadPrediction
 
 
 class PadGains(eqx.Module):
@@ -31,13 +31,20 @@ class PadGains(eqx.Module):
         """What the pads would have read at the calibration."""
         return pressures * jnp.exp(-self.log_gain).astype(pressures.dtype)
 
-    def forces(self, response: Callable[[Array], Prediction], pressures: Float[Array, "n pads"]) -> Prediction:
+    def forces(self, response: Callable[[Array], PadPrediction], pressures: Float[Array, "n pads"]) -> PadPrediction:
         """Prediction of `response`, a function of calibrated pressures (n, pads) Pa, from pressures as read now."""
         then = self.unmoved(pressures)
-        found = response(then)
-        slopes = gain_slopes(lambda p: response(p).force, then)
-        variance = jnp.einsum("qnr,qs,snr->nr", slopes, self.covariance.astype(then.dtype), slopes)
-        return found._replace(standard_error=jnp.sqrt(found.standard_error**2 + jnp.maximum(variance, 0)))
+        found, slopes = response(then), gain_slopes(lambda p: response(p).force, then)
+        variance, of_total = self._variance(slopes), self._variance(jnp.sum(slopes, -1, keepdims=True))[:, 0]
+        return found._replace(
+            standard_error=jnp.sqrt(found.standard_error**2 + variance),
+            total_variance=found.total_variance + of_total,
+        )
+
+    def _variance(self, slopes: Float[Array, "pads n k"]) -> Float[Array, "n k"]:
+        """Variance (N^2) of forces with these slopes by the gains, whose errors pads may have in common."""
+        found = jnp.einsum("qnr,qs,snr->nr", slopes, self.covariance.astype(slopes.dtype), slopes)
+        return jnp.maximum(found, 0)
 
 
 def gain_slopes(

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 import jaxeit as je
 
@@ -27,12 +27,13 @@ from .curves.fitted import FittedCurve, Prediction, predict_pads
 from .curves.samples import bucket
 from .fields.base import AbstractField
 from .fields.fit import fit_field
-from .fields.fitted import FittedField, log_gain
+from .fields.fitted import FittedField, LogGain, log_gain
 from .fields.geometry import Geometry
 from .fields.places import Places, nowhere
 from .intervals import NORMAL_MULTIPLE, NoiseLaw
 from .losses import AbstractLoss
 from .pad_gains import PadGains
+from .pad_predictions import PadPrediction, independent, with_gain
 from .results import FitResult
 
 ALTERNATIONS = 2  # fits of the field, then of the curves; more change the result by far less than the noise
@@ -104,22 +105,22 @@ class PadModel(eqx.Module):
         readings: Float[Array, "n pads"],
         places: Places | None = None,
         before: Float[Array, "m pads"] | None = None,
-    ) -> Prediction:
+    ) -> PadPrediction:
         """Forces from readings (n, pads) Pa and own pressures `before` them, with the errors of the gains; pure."""
 
-        def response(unmoved: Array) -> Prediction:
+        def response(unmoved: Array) -> PadPrediction:
             return self._continued(self._unmixed(unmoved), places, before)
 
         return response(readings) if self.gains is None else self.gains.forces(response, readings)
 
-    def _continued(self, own: Array, places: Places | None, before: Array | None) -> Prediction:
+    def _continued(self, own: Array, places: Places | None, before: Array | None) -> PadPrediction:
         """`predict` for curves with memory that start from own pressures `before` (m, pads)."""
         if before is None:
             return self.predict(own, places)
         first, whole = len(before), jnp.concatenate([before, own])
         if places is not None:
             places = places[jnp.maximum(jnp.arange(len(whole)) - first, 0)]
-        return Prediction(*(part[first:] for part in self.predict(whole, places)))
+        return PadPrediction(*(part[first:] for part in self.predict(whole, places)))
 
     @property
     def coefficients(self) -> float:
@@ -137,34 +138,33 @@ class PadModel(eqx.Module):
         level, noisy = predict(self, jnp.concatenate([rest, self._noise_of_own(rest)])).force
         return jnp.hypot(floor, noisy - level)
 
-    def predict(self, own: Float[Array, "n pads"], places: Places | None = None) -> Prediction:
+    def predict(self, own: Float[Array, "n pads"], places: Places | None = None) -> PadPrediction:
         """Forces from the pads' own pressures (n, pads) Pa; pure. Without places the gain is one, and the standard
         error includes its variation over the pad."""
-        force, error, valid = (part.T for part in _predict_curves(self.curves, own.T))
+        found = _of_curves(self.curves, own)
         if self.field is None:
-            return Prediction(force, error, valid)
+            return independent(found)
         gain = self.field.log_gain(nowhere(own) if places is None else places)
-        factor = jnp.exp(gain.mean)
-        return Prediction(force * factor, factor * jnp.sqrt(error**2 + force**2 * gain.variance), valid)
+        return with_gain(found, gain, self.field.field.shared)
 
     def single(
         self,
         readings: Float[Array, "n pads"],
         places: Places | None = None,
         before: Float[Array, "m pads"] | None = None,
-    ) -> Prediction:
+    ) -> PadPrediction:
         """`forces` of single readings: the standard error includes the noise about the model and of the sensors; pure.
 
         Curves are fitted to means over parts of presses, which hold little of the sensors' noise. Without a noise law,
         the noise is that of the residuals of the fitted samples.
         """
         found = self.forces(readings, places, before)
-        variance = found.standard_error**2 + self._noise.variance(found.force)
+        variance = self._noise.variance(found.force)
         if self.sensor is not None:
             # The force of a pad depends on its own pressure alone, so that all pads may be moved at once.
             noisy = self.own(readings) + self._noise_of_own(readings)
             variance += (self._continued(noisy, places, before).force - found.force) ** 2
-        return found._replace(standard_error=jnp.sqrt(variance))
+        return found.with_noise(variance)
 
     def _noise_of_own(self, readings: Float[Array, "n pads"]) -> Float[Array, "n pads"]:
         """Standard deviation of the pads' own pressures (Pa) by the noise of the sensors, which must be known.
@@ -186,7 +186,7 @@ class PadModel(eqx.Module):
         over the pad. A force is not valid outside the fitted pressures, or where the fit of the pad failed.
         """
         found = pad_forces(self, jnp.asarray(pressures, self.dtype), places)
-        return tuple(map(np.asarray, found))  # type: ignore[return-value]
+        return np.asarray(found.force), np.asarray(found.standard_error), np.asarray(found.valid)
 
     def hold_forces(
         self, pressures: Float[ArrayLike, "n pads"], places: Places | None = None
@@ -194,25 +194,15 @@ class PadModel(eqx.Module):
         """Force on each pad (n, pads) N, and half the 90 % interval of their total (n,) N, of means over holds.
 
         The interval is narrower than that of a reading, because a mean holds less noise than the readings in it.
-        See `total_variance` for errors of different pads.
+        See `PadPrediction` for errors of different pads.
 
         Args:
             pressures: means over the holds of presses, (n, pads) Pa.
             places: as for `pad_forces`.
         """
         found = forces(self, jnp.asarray(pressures, self.dtype), places)
-        force, error = np.asarray(found.force), np.asarray(found.standard_error)
-        noise = self._noise if self.hold_noise is None else self.hold_noise
-        return force, noise.half_widths(force, self.total_variance(error))
-
-    def total_variance(self, error: Float[np.ndarray, "n pads"]) -> Float[np.ndarray, " n"]:
-        """Variance (n,) N^2 of the total force, from the standard errors of the pads (n, pads) N.
-
-        Pads that share a field err together: the errors of a press across their wall add up. Others are independent.
-        """
-        if self.field is not None and self.field.field.shared:
-            return np.asarray(error.sum(1) ** 2)
-        return np.asarray((error**2).sum(1))
+        force, noise = np.asarray(found.force), self._noise if self.hold_noise is None else self.hold_noise
+        return force, noise.half_widths(force, np.asarray(found.total_variance))
 
     @property
     def multiple(self) -> float:
@@ -235,19 +225,19 @@ class PadModel(eqx.Module):
 
 
 @je.verb
-def pad_forces(model: PadModel, pressures: Float[Array, "n pads"], places: Places | None = None) -> Prediction:
+def pad_forces(model: PadModel, pressures: Float[Array, "n pads"], places: Places | None = None) -> PadPrediction:
     """`PadModel.pad_forces` as one program: arrays (n, pads)."""
     return model.single(pressures, places)
 
 
 @je.verb
-def forces(model: PadModel, pressures: Float[Array, "n pads"], places: Places | None = None) -> Prediction:
+def forces(model: PadModel, pressures: Float[Array, "n pads"], places: Places | None = None) -> PadPrediction:
     """`PadModel.forces`, compiled."""
     return model.forces(pressures, places)
 
 
 @je.verb
-def predict(model: PadModel, own: Float[Array, "n pads"], places: Places | None = None) -> Prediction:
+def predict(model: PadModel, own: Float[Array, "n pads"], places: Places | None = None) -> PadPrediction:
     """`PadModel.predict`, compiled."""
     return model.predict(own, places)
 
@@ -328,31 +318,41 @@ def _weights(force: np.ndarray, place: np.ndarray, use: np.ndarray) -> np.ndarra
 
 
 class PadForces(NamedTuple):
-    """Predicted pad forces on the host, and their standard errors by the model, (n, pads) N; NaN without a fit."""
+    """Predicted pad forces on the host, (n, pads) N, NaN without a fit; and the variance of their total by the model,
+    (n,) N^2."""
 
     force: np.ndarray
-    standard_error: np.ndarray
+    total_variance: np.ndarray
 
 
 def over_holds(model: PadModel, presses: LocatedPresses) -> PadForces:
     """Pad forces over the holds of the presses, (presses, pads)."""
-    found = predict(model, jax.device_put(presses.data.pressure), presses.places)
-    good = np.asarray(model.curves.result) == FitResult.SUCCESS
-    return PadForces(np.where(good, found.force, np.nan), np.asarray(found.standard_error))
+    return _of_fits(model, predict(model, jax.device_put(presses.data.pressure), presses.places))
 
 
 def along_presses(model: PadModel, presses: LocatedPresses) -> PadForces:
     """Pad forces at all samples of the presses, (n, pads)."""
     data = presses.data
-    found = predict_curves(model.curves, jax.device_put(data.sample_pressure))
-    force, error = np.asarray(found.force).T, np.asarray(found.standard_error).T
-    force = np.where(np.asarray(model.curves.result) == FitResult.SUCCESS, force, np.nan)
-    if model.field is None or presses.places is None:
-        return PadForces(force, error)
-    gain = log_gain(model.field, presses.places)
-    mean, variance = (np.asarray(part)[data.sample_press] for part in gain)
-    factor = np.exp(mean)
-    return PadForces(force * factor, factor * np.sqrt(error**2 + force**2 * variance))
+    places = None if model.field is None else presses.places
+    own, press = jax.device_put((data.sample_pressure.T, data.sample_press))
+    return _of_fits(model, _along(model, own, press, places))
+
+
+@je.verb
+def _along(
+    model: PadModel, own: Float[Array, "n pads"], press: Int[Array, " n"], places: Places | None
+) -> PadPrediction:
+    """`PadModel.predict` at samples of presses, from the places of the presses (None: the curves alone)."""
+    found = _of_curves(model.curves, own)
+    if model.field is None or places is None:
+        return independent(found)
+    gain = model.field.log_gain(places)  # of the presses, which are far fewer than their samples
+    return with_gain(found, LogGain(gain.mean[press], gain.variance[press]), model.field.field.shared)
+
+
+def _of_fits(model: PadModel, found: PadPrediction) -> PadForces:
+    good = np.asarray(model.curves.result) == FitResult.SUCCESS
+    return PadForces(np.where(good, found.force, np.nan), np.asarray(found.total_variance))
 
 
 @je.verb
@@ -361,13 +361,10 @@ def _curve_forces(curves: FittedCurve, pressure: Float[Array, "pads n"]) -> Floa
     return found * _load(curves, pressure)
 
 
-def _predict_curves(curves: FittedCurve, pressure: Float[Array, "pads n"]) -> Prediction:
-    """Forces of the curves of all pads, (pads, n); a pad at rest bears none, whatever the offset of its curve."""
-    found, load = predict_pads(curves, pressure), _load(curves, pressure)
-    return found._replace(force=found.force * load, standard_error=found.standard_error * load)
-
-
-predict_curves = je.verb(_predict_curves)
+def _of_curves(curves: FittedCurve, own: Float[Array, "n pads"]) -> Prediction:
+    """Forces of the curves of all pads, (n, pads); a pad at rest bears none, whatever the offset of its curve."""
+    found, load = predict_pads(curves, own.T), _load(curves, own.T)
+    return Prediction((found.force * load).T, (found.standard_error * load).T, found.valid.T)
 
 
 def _zero_at_rest(curve: AbstractCurve) -> bool:

@@ -156,7 +156,7 @@ def hold_out_response(
     wider = hold_out_scaled(folds, response.without, scale) if scale > 1 else held
     return HeldOutForces(
         held.hold.force,
-        held.half_widths(data, response.model.total_variance(wider.hold.standard_error)),
+        held.half_widths(data, wider.hold.total_variance),
         held.noise(data),
         hold_noise,
         scale,

@@ -412,7 +412,8 @@ def test_standard_errors_of_forces_are_those_of_drawn_gains(calibration):
     gains = PadGains(jnp.asarray(np.log(GAINS)), jnp.asarray(covariance))
     exact = replace(calibration.curves, covariance=jnp.zeros((4, 1, 1)))
     pressures = jnp.array([[1000.0, 200.0, jnp.nan, 50.0]])
-    force, error, _ = (np.asarray(part)[0] for part in PadModel(exact, gains=gains).forces(pressures))
+    found = PadModel(exact, gains=gains).forces(pressures)
+    force, error = np.asarray(found.force)[0], np.asarray(found.standard_error)[0]
     drawn = np.random.default_rng(0).multivariate_normal(np.log(GAINS), covariance, 20_000)
     forces = SLOPE * np.asarray(pressures) * np.exp(-drawn)
     np.testing.assert_allclose(np.delete(error, 2), np.delete(forces.std(0), 2), rtol=0.03)

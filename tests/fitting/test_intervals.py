@@ -8,13 +8,16 @@ import pytest
 from scipy.special import ndtr
 
 from calib.fitting.curves import Linear
+from calib.fitting.curves.fitted import Prediction
 from calib.fitting.fields import PadEdge, geometry_of, single_places
+from calib.fitting.fields.fitted import LogGain
 from calib.fitting.held_out import Folds, folds_by_place
 from calib.fitting.intervals import NORMAL_MULTIPLE, NoiseLaw, fit_noise
 from calib.fitting.losses import SoftL1
 from calib.fitting.neighbourhoods import error_scale, with_error_scale
 from calib.fitting.pad_gains import PadGains
-from calib.fitting.pads import LocatedPresses, PadModel, fit_pads, forces
+from calib.fitting.pad_predictions import with_gain
+from calib.fitting.pads import LocatedPresses, PadModel, fit_pads, forces, pad_forces
 from calib.fitting.response import fit_response, fold_presses, hold_out_response
 from calib.presses.pooled import MIN_SHARE, PressData
 from jaxeit.geometry.shapes import Polygon
@@ -109,9 +112,9 @@ def test_means_over_holds_have_intervals_of_their_own(skin):
         model = PadModel(model.curves, noise=held.noise(data), hold_noise=held.hold_noise(data))
         force, half = model.hold_forces(new.pressure)
         inside = np.abs(force.sum(1) - new.force) <= half
-        everything, error, _ = model.pad_forces(new.sample_pressure.T)
-        wide = model.noise.multiple * np.sqrt((error**2).sum(1))
-        sampled = np.abs(everything.sum(1) - new.sample_force) <= wide
+        everything = pad_forces(model, jnp.asarray(new.sample_pressure.T))
+        wide = model.multiple * np.sqrt(everything.total_variance)
+        sampled = np.abs(everything.force.sum(1) - new.sample_force) <= wide
         covered.append([*(inside[k::3].mean() for k in range(3)), sampled.mean()])
     np.testing.assert_allclose(np.mean(covered, 0), 0.9, atol=0.05)
 
@@ -153,6 +156,32 @@ def test_a_pad_without_a_reading_adds_no_noise_to_the_others(skin):
     shown, stated = scattered(noisy_model(skin, crosstalk_of(0.2)), [1500.0, np.nan, 0.0, 300.0])
     np.testing.assert_allclose(stated, shown, rtol=0.02)  # NaN for the pad itself
     assert np.isfinite(stated[[0, 2, 3]]).all()
+
+
+@pytest.mark.parametrize("common", [0.0, 0.04], ids=["of each pad", "of all pads"])
+def test_the_total_holds_gains_that_pads_have_in_common(skin, common):
+    """Errors of all pads together sum up; as independent ones they would have half of the scatter of the total."""
+    covariance = 1e-4 * np.eye(4) + common**2
+    readings = jnp.array([[1500.0, 1000.0, 1200.0, 1400.0]])
+    unmoved = noisy_model(skin, None)
+    draws = np.random.default_rng(4).multivariate_normal(np.zeros(4), covariance, 20_000)
+    total = np.asarray(forces(unmoved, readings * jnp.exp(jnp.asarray(-draws))).force).sum(1)
+    found = forces(noisy_model(skin, None, PadGains(jnp.zeros(4), jnp.asarray(covariance))), readings)
+    of_gains = np.sqrt(found.total_variance - forces(unmoved, readings).total_variance)
+    np.testing.assert_allclose(of_gains, total.std(), rtol=0.02)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_errors_of_a_field_add_up_where_pads_share_it(skin, shared):
+    """The curves' own errors, of a quarter of the field's, are independent in either case."""
+    curves = Prediction(jnp.array([[3.0, 4.0]]), jnp.array([[0.05, 0.06]]), jnp.ones((1, 2), bool))
+    gain = LogGain(jnp.array([[0.1, -0.1]]), jnp.array([[0.06**2, 0.07**2]]))
+    found, rng = with_gain(curves, gain, shared), np.random.default_rng(6)
+    of_field = np.repeat(rng.normal(size=(400_000, 1)), 2, 1) if shared else rng.normal(size=(400_000, 2))
+    force = np.asarray(curves.force) + np.asarray(curves.standard_error) * rng.normal(size=(400_000, 2))
+    scatter = np.exp(np.asarray(gain.mean)) * (force + curves.force * np.sqrt(np.asarray(gain.variance)) * of_field)
+    np.testing.assert_allclose(found.standard_error[0], scatter.std(0), rtol=0.01)
+    np.testing.assert_allclose(np.sqrt(found.total_variance[0]), scatter.sum(1).std(), rtol=0.01)
 
 
 def pressed(skin, sites, rng, dip, width, spread):

@@ -68,6 +68,19 @@ def truth(skin, curve, field):
     return fit_pads(curve, field, LocatedPresses(data, geometry_of(skin), single_places(place, 4)), SoftL1())
 
 
+def fits(skin, true, curve, field):
+    """Fits to `TRIALS` simulations of the true model."""
+    for trial in range(TRIALS):
+        rng = np.random.default_rng([2, trial])
+        place = places(rng)
+        data = presses_at(place, rng.uniform(1500, 2000, PRESSES), rng, partial(forces, true))
+        known = LocatedPresses(data, geometry_of(skin), single_places(place, 4))
+        model = fit_pads(curve, field, known, SoftL1())
+        assert (np.asarray(model.curves.result) == 0).all()
+        assert isinstance(model, PadModel)
+        yield model
+
+
 def pulls(skin, curve, field):
     """Errors over stated errors of fits to `TRIALS` simulations, (trials, samples), at loads of all pads."""
     true = truth(skin, curve, field)
@@ -79,14 +92,7 @@ def pulls(skin, curve, field):
     pressure = jnp.asarray(new.sample_pressure.T)
     expected = np.asarray(predict(true, pressure, at).force)[own]
     found = []
-    for trial in range(TRIALS):
-        rng = np.random.default_rng([2, trial])
-        place = places(rng)
-        data = presses_at(place, rng.uniform(1500, 2000, PRESSES), rng, partial(forces, true))
-        known = LocatedPresses(data, geometry_of(skin), single_places(place, 4))
-        model = fit_pads(curve, field, known, SoftL1())
-        assert (np.asarray(model.curves.result) == 0).all()
-        assert isinstance(model, PadModel)
+    for model in fits(skin, true, curve, field):
         seen = predict(model, pressure, at)
         found.append((np.asarray(seen.force)[own] - expected) / np.asarray(seen.standard_error)[own])
     return np.array(found)
@@ -116,3 +122,19 @@ def test_pulls_of_every_field(name, skin):
 @pytest.mark.slow
 def test_pulls_of_a_curve_that_bends_with_a_field(skin):
     judge(pulls(skin, CURVES.make("polynomial"), FIELDS.make("edge")), 0.8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["edge", "edge-spline", "bilinear"])
+def test_pulls_of_the_total_of_presses_across_walls(name, skin):
+    """Of pads that share a field, independent errors had pulls of 1.2; of pads with fields of their own, errors that
+    add up had pulls of 0.65."""
+    field = FIELDS.make(name)
+    true, at = truth(skin, Linear(), field), np.array([[0.1, 0.05], [0.1, 0.15], [0.05, 0.1], [0.17, 0.1]])
+    parts = np.array([[0.5, 0.5, 0, 0], [0, 0, 0.7, 0.3], [0.5, 0, 0.5, 0], [0, 0.5, 0, 0.5]])
+    pressure, where = jnp.asarray(1700 * parts), single_places(at, 4)
+    expected, found = forces(true, pressure, at), []
+    for model in fits(skin, true, Linear(), field):
+        seen = predict(model, pressure, where)
+        found.append((np.asarray(seen.force).sum(1) - expected) / np.sqrt(seen.total_variance))
+    assert 0.75 < np.std(found) < 1.1
