@@ -332,10 +332,45 @@ def test_the_files_of_a_rosbag_can_be_read_alone(bag, here, capsys):
     path.with_name("s.h5").unlink()
     both = ("--stream", "force=/ft/wrench.wrench.force.z,/skin.data:N")
     assert "has columns of several topics" in refusal(capsys, "mcap", path, *both)
-    assert "column '/ft.log_time': not there" in refusal(capsys, "mcap", path, "--stream", "force=/ft.z:N")
+    said = refusal(capsys, "mcap", path, "--stream", "force=/ft.z:N")
+    assert "topic '/ft': not there; topics are /ft/wrench, /skin; " in said
     raw = path.read_bytes()
     path.write_bytes(raw[:100])
     assert "cannot be read" in refusal(capsys, "mcap", path, *BAG_WORDS)
+
+
+def test_a_folder_without_metadata_names_the_file_in_it(bag, here, capsys):
+    (bag / "metadata.yaml").unlink()
+    (path,) = bag.iterdir()
+    said = refusal(capsys, "mcap", bag, *BAG_WORDS)
+    assert said.endswith(f"metadata.yaml: is not in the folder; name the file in it, {path}")
+    path.unlink()
+    assert refusal(capsys, "mcap", bag, *BAG_WORDS).endswith("is not in the folder; name the folder of a bag")
+
+
+def test_messages_about_topics(bag, here, capsys):
+    (path,) = bag.glob("bag.*")
+    if path.suffix != ".mcap":
+        pytest.skip("of the file alone")
+    assert "topic 'skin': not there; topics are /ft/wrench, /skin; did you mean '/skin'?" in refusal(
+        capsys, "mcap", bag, "--stream", "pressure=skin.data:kPa"
+    )
+    raw = path.read_bytes()
+    path.write_bytes(raw[:8])
+    assert "file: ends after 8 bytes; the file is damaged" in refusal(capsys, "mcap", path, *BAG_WORDS)
+    place = raw.index(b"geometry_msgs/msg/WrenchStamped") - 12  # a byte of the length of the chunk's first record
+    path.write_bytes(raw[:place] + b"\xff" + raw[place + 1 :])
+    said = refusal(capsys, "mcap", path, *BAG_WORDS)
+    assert "topic '/ft/wrench': holds no number that can be read; name another topic, or take another copy" in said
+
+
+def test_an_empty_topic_is_named(here, tmp_path, capsys):
+    rosbag2, typesys = pytest.importorskip("rosbags.rosbag2"), pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    with rosbag2.Writer(tmp_path / "bag", version=9) as writer:
+        writer.add_connection("/skin", "std_msgs/msg/Float64MultiArray", typestore=store)
+    said = refusal(capsys, "mcap", tmp_path / "bag", *BAG_WORDS[2:])
+    assert "topic '/skin': holds no message; name another topic, or record again" in said
 
 
 @pytest.mark.parametrize(("kind", "module"), [("mcap", "rosbags"), ("parquet", "pyarrow")])

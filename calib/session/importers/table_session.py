@@ -22,7 +22,7 @@ from ..units import KNOWN_UNITS, UNITS, VARIABLE_UNIT, wrong_quantity
 from ..writer import SessionWriter, program
 from .base import About
 from .clocks import Clock, clock_of, clock_of_rate, common_start, join_clocks, nanoseconds
-from .columns import FileSpec, StreamSpec, column_indices, name_and_unit
+from .columns import FileSpec, StreamSpec, name_and_unit
 from .limits import MAX_COLUMNS
 from .reports import FileReport, ImportReport, StreamReport
 from .sentinels import sentinel_warnings
@@ -134,12 +134,12 @@ def _load(
 def _load_part(file: AbstractTableFile, spec: FileSpec, sort: bool, about: About, used: int) -> _Part:
     path, wanted, places, units, notes = file.path, [], {}, {}, list[str]()
     if spec.rate_hz is None:
-        wanted = _indices(file, spec.time)
+        wanted = file.indices(spec.time)
         if len(wanted) > 1:
             raise problem(path, f"--time {printable(spec.time)}", f"names {len(wanted)} columns", "name one")
         time_unit = _clock_unit(file, spec, wanted, notes)
     for stream in spec.streams:
-        found = [i for text in stream.columns for i in _indices(file, text)]
+        found = [i for text in stream.columns for i in file.indices(text)]
         places[stream.name] = list(range(len(wanted), len(wanted) + len(found)))
         where = f"--stream {printable(stream.name)}"
         if any(column in file.dates for column in found):
@@ -159,14 +159,6 @@ def _load_part(file: AbstractTableFile, spec: FileSpec, sort: bool, about: About
     else:
         clock = clock_of_rate(path, len(table.line), spec.rate_hz, spec.start)
     return _Part(path, table, clock, places, units, file.counted, tuple(notes))
-
-
-def _indices(file: AbstractTableFile, column: str) -> list[int]:
-    """The columns that one text names; raises `SessionError` if they are not there, or hold no numbers."""
-    if column in file.refused:
-        what = f"holds {file.refused[column]}, which cannot be read as numbers"
-        raise problem(file.path, f"column {column!r}", what, "convert it to numbers, or leave it out")
-    return column_indices(file.path, column, file.header, file.columns)
 
 
 def _clock_unit(file: AbstractTableFile, spec: FileSpec, wanted: Sequence[int], notes: list[str]) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import problem
+from .columns import column_indices
 
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
@@ -66,6 +67,13 @@ class AbstractTableFile(ABC):
     counted: str = "row"
     dates: Mapping[int, bool] = MappingProxyType({})
     refused: Mapping[str, str] = MappingProxyType({})
+
+    def indices(self, column: str) -> list[int]:
+        """The columns that one text names; raises `SessionError` if they are not there, or hold no numbers."""
+        if column in self.refused:
+            what = f"holds {self.refused[column]}, which cannot be read as numbers"
+            raise problem(self.path, f"column {column!r}", what, "convert it to numbers, or leave it out")
+        return column_indices(self.path, column, self.header, self.columns)
 
     @abstractmethod
     def read(self, columns: Sequence[int], used: int, progress: Progress) -> Table:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from ...errors import problem
+from ..child import DAMAGED
 
 FOOTER = 37
 """Bytes at the end of a file: opcode, length of the record, start of the summary and of its offsets, CRC, magic."""
@@ -22,15 +23,18 @@ BLOCK = 1 << 20
 
 
 def require_summary(path: Path) -> None:
-    """Refuse an MCAP file whose summary differs from its checksum; a file without checksum or footer passes.
+    """Refuse an MCAP file that is too short, or whose summary differs from its checksum; one without it passes.
 
     Raises:
-        SessionError: for a summary that is damaged.
+        SessionError: for a file that is damaged.
     """
     with open(path, "rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        if size < FOOTER:
+            raise problem(path, "file", f"ends after {size} bytes", DAMAGED)
         stated = _stated(file)
         if stated and stated != _computed(file):
-            raise problem(path, "summary", "differs from its checksum", "the file is damaged; take another copy")
+            raise problem(path, "summary", "differs from its checksum", DAMAGED)
 
 
 def write_summary_checksum(path: Path) -> None:
@@ -42,9 +46,7 @@ def write_summary_checksum(path: Path) -> None:
 
 
 def _stated(file: BinaryIO) -> int:
-    """The checksum in the footer; 0: none."""
-    if file.seek(0, os.SEEK_END) < FOOTER:
-        return 0
+    """The checksum in the footer; 0: none, or no footer."""
     file.seek(-CRC, os.SEEK_END)
     checksum, magic = file.read(CRC - MAGIC), file.read(MAGIC)
     return int.from_bytes(checksum, "little") if magic == END else 0

@@ -1,9 +1,10 @@
 """Recordings of ROS: MCAP files, rosbag2 folders and SQLite files, and bags of ROS 1. ROS itself is not needed."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, ClassVar
@@ -11,9 +12,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from jaxeit.budget import current_budget
+from jaxeit.spelling import did_you_mean
 
 from ...errors import printable, problem
-from ..arrays import AbstractArrayImporter, ArrayShape
+from ..arrays import AbstractArrayImporter, ArrayFile, ArrayShape
 from ..child import library
 from ..columns import FileSpec
 from ..limits import MAX_NAMES, check_size
@@ -22,7 +24,28 @@ from .mcap_checksums import require_summary
 
 EXTRA = "tables"
 LOG_TIME = "log_time"
+METADATA = "metadata.yaml"
+FILES = (".mcap", ".db3")
 MAX_DEPTH = 8
+
+
+class BagFile(ArrayFile):
+    """A recording of ROS as a table. A column of no topic, or of one without numbers, names the topic."""
+
+    def indices(self, column: str) -> list[int]:
+        """See `AbstractTableFile.indices`."""
+        topic, where = column.split(".")[0], f"topic {column.split('.')[0]!r}"
+        own = [name for name in self._shapes if name.split(".")[0] == topic]
+        if not own and not column.isdecimal():
+            topics = list(dict.fromkeys(name.split(".")[0] for name in self._shapes))
+            what = f"not there; topics are {', '.join(topics)}"
+            raise problem(self.path, where, what, did_you_mean(topic, topics, "name one of them"))
+        if own and not self._shapes[own[0]].rows:
+            raise problem(self.path, where, "holds no message", "name another topic, or record again")
+        if len(own) == 1 and column not in own:
+            what = "holds no number that can be read"
+            raise problem(self.path, where, what, "name another topic, or take another copy of a damaged file")
+        return super().indices(column)
 
 
 class McapImporter(AbstractArrayImporter):
@@ -42,6 +65,11 @@ class McapImporter(AbstractArrayImporter):
             group.time = group.time or ("" if group.rate is not None else f"{LOG_TIME}:s")
         specs = super().file_specs(args)
         return [_with_clock(spec, index) for spec in specs for index in range(len(spec.streams))] or list(specs)
+
+    @classmethod
+    def opener(cls, args: argparse.Namespace) -> Callable[[Path], ArrayFile]:
+        """See `AbstractTableImporter.opener`."""
+        return partial(BagFile, cls)
 
     @classmethod
     def outline(cls, path: Path) -> dict[str, ArrayShape]:
@@ -90,6 +118,10 @@ def _opened(path: Path) -> Iterator[Any]:
     """The recording; bags without definitions of their messages are read as those of the latest ROS 2."""
     if not path.is_dir():
         first_bytes(path)
+    elif not (path / METADATA).exists():
+        inside = [file.name for file in sorted(path.iterdir()) if file.suffix in FILES]
+        todo = f"name the file in it, {printable(path / inside[0], 300)}" if inside else "name the folder of a bag"
+        raise problem(path, METADATA, "is not in the folder", todo)
     highlevel, typesys = library("rosbags.highlevel", EXTRA), library("rosbags.typesys", EXTRA)
     store = typesys.get_typestore(typesys.Stores.LATEST)
     for file in _mcap_files(path):
