@@ -100,7 +100,7 @@ class LiveRecalibrator:
         calibration: the calibration with which live began.
         path: calibration file to which the moved calibration is written, every minute and at the end; None: none.
         drift: how far gains may have moved since the calibration.
-        tell: called with the health of the calibration when the advice changes.
+        tell: called with the health of the calibration when the advice changes, or an update fails.
         layer: tells the gain of the contact layer that followed contacts have told, which is written too; None: none.
     """
 
@@ -122,7 +122,8 @@ class LiveRecalibrator:
         self._blocks, self._last = 0, 0
         self._waiting: deque[_Block] = deque(maxlen=MAX_WAITING)
         self._worker: threading.Thread | None = None
-        self._found: GainUpdate | None = None
+        self._found: GainUpdate | Exception | None = None  # what the newest update gave
+        self._failure = ""  # of the newest update, in words
         self._fresh, self._saved = 0, 0
         self.record: Recalibration | None = None
         self.offset = np.zeros(len(self._threshold))
@@ -131,7 +132,9 @@ class LiveRecalibrator:
 
     @property
     def health(self) -> str:
-        """How far off the calibration is, in one line."""
+        """How far off the calibration is, or why the newest update failed, in one line."""
+        if self._failure:
+            return self._failure
         if self.record is None:
             return "calibration health: not known before a few contacts on each pad"
         return self.record.health
@@ -206,32 +209,46 @@ class LiveRecalibrator:
         self._fresh = 0
         if len(self._contacts) < MIN_CONTACTS:
             return
+        self._found = None
         self._worker = threading.Thread(
             target=self._update, args=(self._contacts.seen(),), daemon=True, name="recalibration"
         )
         self._worker.start()
 
     def _update(self, seen: SeenContacts) -> None:
-        self._found = update_from_use(self._prior, self._reference, self._noise, seen)
+        try:
+            self._found = update_from_use(self._prior, self._reference, self._noise, seen)
+        except Exception as error:  # of any type: the thread that takes the update over says it
+            self._found = error
 
     def _take_over(self) -> None:
         """Use the result of an update, within bounds."""
         if self._worker is None or self._worker.is_alive():
             return
         self._worker, update = None, self._found
+        if isinstance(update, Exception):
+            self._tell_failure(update)
+            return
         if update is None or not np.isfinite(update.mean).all():
             return
         start = np.zeros_like(update.mean)
         mean = np.clip(update.mean, start - MAX_MOVE, start + MAX_MOVE)
-        advice = None if self.record is None else self.record.advice
+        known = None if self.record is None or self._failure else self.record.advice
+        self._failure = ""
         self.record = self._recorded(update._replace(mean=mean))
         self.gains = PadGains(jnp.asarray(mean), jnp.asarray(update.covariance))
-        if self.record.advice is not advice:
+        if self.record.advice is not known:
             self._tell(self.health)
         if self._saved + SAVE_INTERVAL * 1e9 < self._last:
             self._saved = self._last
             moved = self._moved()  # here, because the other thread must not ask JAX for numbers
             threading.Thread(target=self._write, args=(moved,), daemon=True, name="saving the calibration").start()
+
+    def _tell_failure(self, error: Exception) -> None:
+        known, why = self._failure, repr(error)  # of one line
+        self._failure = f"calibration health: an update failed, and gains stay as they are: {why}"
+        if self._failure != known:
+            self._tell(self.health)
 
     def _recorded(self, update: GainUpdate) -> Recalibration:
         force = np.maximum(self._contacts.seen().force, 0)
@@ -253,7 +270,7 @@ class LiveRecalibrator:
         found = self._calibration if layer is None else replace(self._calibration, layer=layer)
         if self.record is None:
             return found
-        return replace(found, recalibration=self.record, notes=(*self._calibration.notes, self.health))
+        return replace(found, recalibration=self.record, notes=(*self._calibration.notes, self.record.health))
 
     def _write(self, moved: Calibration) -> None:
         if self._path is not None and moved is not self._calibration:

@@ -4,6 +4,7 @@ import json
 import threading
 from copy import copy
 from dataclasses import replace
+from unittest.mock import Mock
 
 import jax.numpy as jnp
 import numpy as np
@@ -319,6 +320,36 @@ def test_live_gains_and_zero_are_bounded(calibration):
     follower.add(dv, np.zeros(4), False, 3001 * S)
     np.testing.assert_allclose(follower.gains.log_gain, [0.3, -0.3, 0, 0])
     assert any("bound" in note for note in follower.record.notes)
+
+
+def test_an_update_that_fails_leaves_the_one_before_and_says_so(calibration, monkeypatch):
+    """The update before it was recorded again, as if it were new."""
+    told = []
+    follower = LiveRecalibrator(calibration, tell=told.append)
+    for number in range(8):
+        seen = SeenContacts(np.zeros(1), np.zeros((1, 2)), np.ones((1, 4)), np.ones((1, 4)), np.zeros(4))
+        follower._contacts.add(number, seen)
+
+    def update(raised=None):
+        good = GainUpdate(np.array([0.1, -0.1, 0.0, 0.0]), 1e-4 * np.eye(4), np.ones(4, bool), 1.0, 0.0, np.ones(1))
+        made = Mock(return_value=good, side_effect=raised)
+        monkeypatch.setattr("calib.live.recalibrator.update_from_use", made)
+        follower._fresh = 1
+        follower.use_spare_time()
+        follower._worker.join()
+        follower.add(np.zeros(calibration.recon.readings), np.zeros(4), False, S)
+        return follower.record, follower.gains
+
+    before = update()
+    assert told == [before[0].health]
+    for _ in range(2):  # it is said once
+        after = update(np.linalg.LinAlgError("no factor"))
+        assert all(one is other for one, other in zip(before, after, strict=True))
+    assert told[1:] == [follower.health]
+    assert "no factor" in follower.health
+    after = update()
+    assert after[0] is not before[0]
+    assert told[2:] == [follower.health] == [after[0].health]
 
 
 # --- refusals --------------------------------------------------------------------------------------------------------
