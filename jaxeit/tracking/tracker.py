@@ -49,6 +49,8 @@ MOST_GAIN = 4.0
 WORSE = 1.3
 # Part of the signal of contacts that a frame may be off, for contacts that moved on while frames waited for too long.
 UNSEEN = 0.01
+# Of the half length of an edge, the middles of nine equal parts.
+ALONG = (np.arange(9) - 4) / 4.5
 
 
 class Tracker:
@@ -118,6 +120,9 @@ class Tracker:
     ) -> Bool[np.ndarray, " n"]:
         """Of which contacts pads tell the force, (n,): at least `TOLD` of the load lies on pads whose force is known.
 
+        The same rule is part of each step of the filter (`telling_pads`); here
+        it is computed in NumPy, as tracks are any number and JAX would compile a program for each.
+
         Args:
             pad_errors: as for `step`; not finite for a pad that tells no force.
         """
@@ -125,10 +130,11 @@ class Tracker:
             return np.zeros(len(tracks), bool)
         sheet, known = self.filter.sheet, np.isfinite(np.asarray(pad_errors, float))
         area, pixels = np.asarray(sheet.pad_area)[:, known].sum(1), np.asarray(sheet.pixels)
-        places, width = np.array([one.position for one in tracks]), np.array([one.width for one in tracks])
+        rows = np.array([one.position + np.multiply.outer(ALONG, one.half) for one in tracks])
+        width = np.array([one.width for one in tracks])[:, None]
         width = np.maximum(width, np.sqrt(self.area / len(pixels)))  # narrower loads would fall between pixels
-        square = ((places[:, None] - pixels) ** 2).sum(-1)
-        load = np.exp(-0.5 * square / width[:, None] ** 2) / (2 * np.pi * width[:, None] ** 2)
+        square = ((rows[:, :, None] - pixels) ** 2).sum(-1)
+        load = np.exp(-0.5 * square / width[..., None] ** 2).mean(1) / (2 * np.pi * width**2)
         return np.asarray(load @ area >= TOLD)
 
     def step(

@@ -1,5 +1,6 @@
 """The law of contacts: its updates against a regression in one piece, its honesty, and what it leaves alone."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import multivariate_t
@@ -140,6 +141,19 @@ def test_pads_tell_the_contacts_that_lie_on_them(tracker):
     assert known.tolist() == [False, True, True, True]
     assert not tracker.told_by_pads(on, None).any()
     assert tracker.told_by_pads((), errors).shape == (0,)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("beyond", [-0.015, -0.008, 0.002, 0.01])
+def test_pads_tell_an_edge_as_the_filter_says(tracker, beyond):
+    """The middle of an edge lies on a dead pad, its end on another: the filter and the tracks must agree."""
+    edge = track(5.0, 0.006, place=(0.1 + beyond, 0.05))._replace(half=np.array([0.025, 0.0]))
+    errors = np.array([np.nan, 0.1, 0.1, 0.1])
+    row = [*edge.position, np.log(edge.width), np.log(edge.force), *edge.half]
+    sheet, contact = tracker.filter.sheet, jnp.asarray([row], tracker.filter.places.dtype)
+    loads = np.asarray(sheet.on_pads(contact, sheet.near(contact)))[0]
+    told = loads[np.isfinite(errors)].sum() >= 0.25 * edge.force
+    assert tracker.told_by_pads((edge,), errors).tolist() == [told]
 
 
 @pytest.mark.slow
