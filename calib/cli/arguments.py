@@ -35,6 +35,22 @@ def at_least_zero(text: str) -> float:
     return value
 
 
+def part(text: str) -> float:
+    """A number from zero to one."""
+    value = float(text)
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"{text}: give a number from 0 to 1")
+    return value
+
+
+def percent(text: str) -> float:
+    """A number above zero, at most one hundred."""
+    value = float(text)
+    if not 0 < value <= 100:
+        raise argparse.ArgumentTypeError(f"{text}: give a number above zero, at most 100")
+    return value
+
+
 LAST_PORT = 65535
 
 

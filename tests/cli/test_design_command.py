@@ -139,6 +139,25 @@ def test_a_design_that_is_ended_during_its_picture_writes_nothing(tmp_path, monk
 
 
 @pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["design", "testbed", "-o", "b.toml", "--relative-noise", "7"],
+            "--relative-noise: 7: give a number from 0 to 1",
+        ),
+        (
+            ["recalibrate", "c.h5", "s.h5", "-o", "n.h5", "--drift", "1e9"],
+            "--drift: 1e9: give a number above zero, at m",
+        ),
+    ],
+)
+def test_parts_and_percents_are_no_multiples(capsys, words, said):
+    with pytest.raises(SystemExit, match="2"):
+        main(words)
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("options", "said"),
     [
         (["--margin", "0.01"], "--margin is about electrodes that move; add --move"),
@@ -150,6 +169,11 @@ def test_a_design_that_is_ended_during_its_picture_writes_nothing(tmp_path, monk
         (["--criterion", "place-error:power=-1"], "power"),
         (["--readings", "46", "--switch", "0", "--relative-noise", "0"], "there are 45 candidates"),
         (["--readings", "12", "--width", "1e-9"], "--width 1e-09: too narrow for the model's mesh; give at least 0.00"),
+        (["--readings", "12", "--width", "0.09"], "--width 0.09: wider than the sheet, which measures 0.08 m; give"),
+        (["--readings", "12", "--noise", "1"], "--noise 1: more than the largest reading, 0.0"),
+        (["--readings", "12", "--noise", "0.03"], "a scan of 12 readings would have a mean error of place of 1"),
+        (["--switch", "1e9"], "--switch 1e+09: a frame then has the time of 6e+09 readings, and there are 45"),
+        (["--rate", "1"], "--rate 1: a frame then has the time of 100000 readings, and there are 45; give more, or"),
         (["--readings", "12", "--picture", "dx.toml"], "dx.toml: give a name that ends in .png, .pdf or .svg"),
         (["--readings", "9", "--switch", "9"], "before one drive has settled"),
     ],

@@ -6,10 +6,21 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from ..arguments import above_zero, at_least_zero, count, picture_kind, prepare_results, require_matplotlib_for, skin_of
+from ..arguments import (
+    above_zero,
+    at_least_zero,
+    count,
+    part,
+    picture_kind,
+    prepare_results,
+    require_matplotlib_for,
+    skin_of,
+)
 from ..terminal import announce_model, progress_bar, show
 
 if TYPE_CHECKING:
+    import numpy as np
+
     import jaxeit as je
     from jaxeit.scan import AbstractCriterion, DesignSettings, PlacementLimits, PlaceSensitivity, ScanDesign
 
@@ -42,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "standard deviation of a reading, V; default: 60 dB below the rms of the scan"
     parser.add_argument("--noise", type=above_zero, metavar="V", help=text)
     text = "further noise of a reading, as part of its voltage, such as 1e-3; default: 0"
-    parser.add_argument("--relative-noise", type=at_least_zero, default=0.0, metavar="PART", help=text)
+    parser.add_argument("--relative-noise", type=part, default=0.0, metavar="PART", help=text)
     _add_placement_arguments(parser)
     parser.add_argument("--picture", metavar="MAP.png", help="draw the expected error over the sheet, before and after")
 
@@ -141,22 +152,38 @@ def _designed(
         better = je.scan.move_electrodes(skin, criterion, limits, settings, pattern=found.pattern, progress=bar).skin
         after = _sensitivity(better, settings)
         found = scan(after)
+    _require_some_accuracy(after, found.pattern)
     better = je.skin.with_rows(better, found.pattern, skin.protocol.sense_channels)
     return _Design((skin, better), (before, after), found)
 
 
 def _sensitivity(skin: "je.Skin", settings: "DesignSettings") -> "PlaceSensitivity":
-    """What each reading tells of contacts; ValueError for contacts that fall between the points of the model."""
+    """What each reading tells of contacts; ValueError for contacts or a noise that cannot be."""
     import numpy as np
 
     import jaxeit as je
 
-    model = je.discretise(je.Scene(skin), je.Fidelity.draft())
+    model, width = je.discretise(je.Scene(skin), je.Fidelity.draft()), settings.width
     corners = np.asarray(model.chart)[np.asarray(model.triangles)]
     least = MIN_WIDTH * float(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=2).max())
-    if settings.width < least:
-        raise ValueError(f"--width {settings.width:g}: too narrow for the model's mesh; give at least {least:.2g} m")
-    return je.scan.place_sensitivity(model, settings)
+    if width < least:
+        raise ValueError(f"--width {width:g}: too narrow for the model's mesh; give at least {least:.2g} m")
+    if width > (most := float(np.ptp(corners.reshape(-1, 2), axis=0).min())):
+        raise ValueError(f"--width {width:g}: wider than the sheet, which measures {most:.3g} m; give it in m")
+    found = je.scan.place_sensitivity(model, settings)
+    if (noise := float(found.noise)) > (most := float(np.abs(found.voltages(skin.protocol.pattern)).max())):
+        raise ValueError(f"--noise {noise:g}: more than the largest reading, {most:.3g} V; give it in V")
+    return found
+
+
+def _require_some_accuracy(sensitivity: "PlaceSensitivity", pattern: "np.ndarray") -> None:
+    """Refuse a scan that does not tell where on the sheet a contact lies."""
+    import numpy as np
+
+    error = float(np.mean(np.asarray(sensitivity.errors(pattern))))
+    if error > (most := float(np.ptp(np.asarray(sensitivity.sites), axis=0).max())):
+        what = f"would have a mean error of place of {1e3 * error:.3g} mm, more than the sheet's {1e3 * most:.3g} mm"
+        raise ValueError(f"a scan of {len(pattern)} readings {what}; give a lower --noise, or more --readings")
 
 
 def _circle(text: str) -> tuple[float, float, float]:
@@ -197,6 +224,10 @@ def _readings(args: argparse.Namespace, skin: "je.Skin") -> int:
     found = int(time / protocol.reading_time * (1 + 1e-9))
     if found < 1:
         raise ValueError(f"--rate {args.rate:g}: a reading alone takes {protocol.reading_time:g} s; give a lower rate")
+    if found > (most := len(je.skin.all_pairs(len(skin.electrodes)))):
+        option, todo = (f"--switch {args.switch:g}", "less") if args.rate is None else (f"--rate {args.rate:g}", "more")
+        what = f"a frame then has the time of {found:.6g} readings, and there are {most:,}"
+        raise ValueError(f"{option}: {what}; give {todo}, or --readings")
     return found
 
 

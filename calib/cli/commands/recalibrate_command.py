@@ -3,7 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from ..arguments import above_zero, prepare_results
+from ..arguments import percent, prepare_results
 from ..terminal import show, title
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = (
         "percent by which a gain may have drifted, of each pad and of all together (standard deviations); default: 10"
     )
-    parser.add_argument("--drift", type=above_zero, default=10.0, metavar="PERCENT", help=text)
+    parser.add_argument("--drift", type=percent, default=10.0, metavar="PERCENT", help=text)
     text = "also learn the gain of the contact layer, from presses or from contacts that are followed"
     parser.add_argument("--learn-layer", action="store_true", help=text)
     text = "continue despite errors that `jaxeit check` finds, or if the session determines the gain of no pad"
