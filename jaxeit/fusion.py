@@ -195,6 +195,11 @@ class ContactShares(eqx.Module):
     share: Float[Array, "... K pads"]
     lies: Float[Array, "... K pads"]
 
+    @property
+    def on(self) -> Bool[Array, "... K pads"]:
+        """Whether each contact lies on each pad: with more than a twentieth of its bump, (..., K, pads)."""
+        return self.lies > MIN_PART_ON_PAD
+
 
 # A contact with a smaller part of its bump on a pad lies beside the pad: the tail of its bump takes no force.
 MIN_PART_ON_PAD = 0.05

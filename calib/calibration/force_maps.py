@@ -172,20 +172,17 @@ def fused(
 _fused = je.verb(fused)
 
 
-# Part of a contact's bump: a pad with less of it on its area does not bear that contact. A fitted bump has tails, and
-# at the border of a pad they reach over to the neighbour.
-_MIN_PART_ON_PAD = 0.1
-
-
 def _of_contacts(
     force: Float[Array, "n pads"], places: Places, shares: je.fusion.ContactShares | None
 ) -> Float[Array, "n K"]:
-    """Force of each contact: its shares of the forces on the pads that it lies on; 0 for an absent contact."""
+    """Force of each contact: its shares of the forces on the pads that it lies on; 0 for an absent contact.
+
+    A contact beside a pad on which there is no other has a share of that pad, but what the pad reads is noise or
+    crosstalk. A contact beside all pads keeps its shares.
+    """
     weight = places.weight
     if shares is not None:
-        beside_all = jnp.all(shares.lies <= _MIN_PART_ON_PAD, -1, keepdims=True)  # such a contact keeps its shares
-        on = (shares.lies > _MIN_PART_ON_PAD) | beside_all
-        weight = jnp.where(on, weight, 0)
+        weight = jnp.where(shares.on | ~jnp.any(shares.on, -1, keepdims=True), weight, 0)
     return jnp.einsum("np,nkp->nk", jnp.where(jnp.isfinite(force), force, 0), weight)
 
 

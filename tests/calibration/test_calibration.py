@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import ndtri
 
 import calib
 import jaxeit as je
@@ -243,6 +244,19 @@ def test_contacts_share_what_their_pad_carries(located):
     assert found.map.standard_error.shape == (2, 400)
     found = calib.force_map(located, np.zeros((3, 550)), np.concatenate([pressures, pressures[:1]]))
     assert found.contact_force.shape == (3, 1)
+
+
+@pytest.mark.parametrize("part", [0.04, 0.07, 0.12])
+def test_no_force_of_pads_is_lost_between_contacts(located, part):
+    """A contact that has a share of the map of a pad has the same share of the pad's force."""
+    law, width, amplitude = law_of(located), jnp.full((1, 2), 0.015), jnp.array([[2.0, 1.0]])
+    position = jnp.array([[[0.1 + 0.015 * ndtri(part), 0.05], [0.15, 0.05]]])  # the first has such a part on pad 1
+    shares = je.fusion.contact_shares(position, width, amplitude, law.recon.centres, law.masks)
+    np.testing.assert_allclose(shares.lies[0, 0, 1], part, atol=0.005)
+    places, pressures = Places(position, shares.share, width, amplitude), jnp.array([[1600.0, 800.0, 0.0, 0.0]])
+    found = eqx.filter_jit(fused)(law, jnp.ones((1, 400)), pressures, places, None, 0.6)
+    np.testing.assert_allclose(found.contact_force[0], shares.share[0, :, :2] @ found.force[0, :2], rtol=1e-9)
+    np.testing.assert_allclose(found.contact_force.sum(), found.force.sum(), rtol=1e-9)
 
 
 def test_a_reading_across_a_wall_has_the_interval_by_which_presses_are_evaluated(located):
