@@ -6,9 +6,6 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
-MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a normal variable over its median absolute deviation: 1 / Phi^-1(3/4)."""
-
 
 def quantiles(
     values: Float[Array, " n"], valid: Bool[Array, " n"], parts: tuple[float, ...]

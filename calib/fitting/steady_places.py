@@ -15,10 +15,10 @@ from jaxtyping import Array, Bool, Float
 
 import jaxeit as je
 
+from ..presses.streams import MAD_TO_SIGMA
 from .fields import Geometry, Places
 from .fields.base import cubic_bspline
 from .fields.geometry import distance, nearest_points
-from .order_statistics import MAD_TO_SIGMA
 
 # Images err towards the middle near the rim of the sheet, alike at all sides: by B-splines over octaves of distance.
 RIM_WIDTH, BUMPS = 8e-3, 3

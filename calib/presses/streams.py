@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-MAD_TO_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+MAD_TO_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute deviation: 1 / Phi^-1(3/4)
 
 
 class PressError(ValueError):

@@ -5,8 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ...presses.streams import MAD_TO_SIGMA
 from ..losses import AbstractLoss
-from ..order_statistics import MAD_TO_SIGMA, median
+from ..order_statistics import median
 from .base import AbstractCurve, Scale
 from .samples import Samples
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ...presses.pooled import MIN_SHARE
-from ..order_statistics import MAD_TO_SIGMA
+from ...presses.streams import MAD_TO_SIGMA
 from ..results import FitResult
 from .base import AbstractField
 from .evidence import LevelFree, Posterior, average_over_priors, without_levels
