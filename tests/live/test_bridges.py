@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import socket
 import struct
 import sys
 import time
@@ -334,6 +335,19 @@ def test_the_server_listens_on_this_machine_only():
     with FoxgloveServer(port=0):
         (address,) = set(listening()) - before
     assert address.startswith("0100007F:")
+
+
+def test_lost_clients_of_foxglove_are_one_line(caplog):
+    pytest.importorskip("foxglove")
+    said = []
+    with FoxgloveServer(port=0, warn=said.append) as server:
+        for _ in range(3):
+            with socket.create_connection(("127.0.0.1", int(server.address.rpartition(":")[2]))) as client:
+                client.sendall(b"no websocket\r\n\r\n")
+                assert client.recv(1) == b""  # the server has dropped it
+    (line,) = said
+    assert re.fullmatch(r"--foxglove: Dropping client \S+ handshake failed; the others are served, and nothing.*", line)
+    assert not [record for record in caplog.records if record.name.startswith("foxglove")]
 
 
 def test_the_foxglove_app_receives_topics_schemas_and_messages(calibration, decoded):

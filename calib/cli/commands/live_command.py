@@ -161,7 +161,7 @@ def _viewers(
     if args.ros2 is not None:
         yield Bridge(calibration, RosNode(args.ros2), **options)
     if args.foxglove is not None:
-        server = FoxgloveServer(args.host, args.foxglove)
+        server = FoxgloveServer(args.host, args.foxglove, warn=say)
         yield Bridge(calibration, server, **options)
         say(f"open {server.address} in Foxglove")
 
