@@ -8,11 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from ..._compile import verb
+from ..._compile import is_traced, verb
 from ...kinds import stated
 from ...model.bases import BasisMap, Pixels
 from ...model.discretisation import Model
@@ -182,15 +181,10 @@ def untouched_frame(
     return frame
 
 
-def _is_known(value: Any) -> bool:
-    """Whether a value can be checked; under a transformation of JAX its numbers are hidden."""
-    return not isinstance(value, Tracer)
-
-
 def sheet_level(v0: Float[Array, " readings"], even: Float[Array, " readings"]) -> Float[Array, ""]:
     """Conductivity of the even sheet nearest to a frame, over that of the model; ``even``: the model's readings."""
     level: Float[Array, ""] = _level(v0, even)
-    if _is_known(level) and not level > 0:
+    if not is_traced(level) and not level > 0:
         raise InverseError("v0 has the opposite sign of the model's readings; reverse its polarity")
     return level
 
@@ -214,14 +208,14 @@ def require_frame(v0: Float[Array, "..."], even: Float[Array, " readings"]) -> N
     """Raise InverseError unless v0 is a frame with readings; ``even``: readings of the model."""
     if v0.shape != even.shape:
         raise InverseError(f"v0 has shape {v0.shape}; give the {len(even)} readings of one frame")
-    if _is_known(v0) and not np.any(np.nan_to_num(v0, posinf=0, neginf=0)):
+    if not is_traced(v0) and not np.any(np.nan_to_num(v0, posinf=0, neginf=0)):
         raise InverseError("v0 has no reading that is finite and not zero")
 
 
 def require_positive(**values: Any) -> None:
     """Raise InverseError, with the name of the value, unless every value that is known is above zero."""
     for name, value in values.items():
-        if _is_known(value) and not 0 < value < np.inf:
+        if not is_traced(value) and not 0 < value < np.inf:
             raise InverseError(f"{name} is {value}; give a number above zero")
 
 
@@ -246,7 +240,7 @@ def require_explained(
         hint: what ends the message, asked for where there is one.
     """
     left: Array = _unexplained(found, known, there)
-    if _is_known(left) and not left < MAX_UNEXPLAINED:
+    if not is_traced(left) and not left < MAX_UNEXPLAINED:
         raise InverseError(
             f"no {what} explains v0: {left:.0%} of it is left; give a frame of this skin, readings in the order of "
             f"the skin's protocol{hint()}"
