@@ -4,6 +4,7 @@ A viewer gets the newest result whenever it is ready, so that a slow viewer sees
 default the server listens on this machine only. The page loads nothing from other servers.
 """
 
+import contextlib
 import json
 import threading
 from http import HTTPStatus
@@ -13,6 +14,7 @@ from typing import Any
 
 from ..calibration.calibration import Calibration
 from ..calibration.logs.calibration import LogCalibration
+from ..record.broadcast import address_family, host_and_port
 from .loop import LiveControl
 from .page_scene import page_scene
 from .results import Result
@@ -23,7 +25,7 @@ PAGE_PARTS = ("page.css", "page.js", "history.js")
 MIN_RESULT_INTERVAL = 0.04  # s between two results for a viewer; the eye sees no more
 KEEP_ALIVE_INTERVAL = 1.0  # s between messages without results, which reveal closed connections
 REQUEST_TIMEOUT = 5.0  # s
-MAX_CONNECTIONS = 32  # at one time; the connections beyond are closed
+MAX_CONNECTIONS = 32  # at one time; as many beyond are told so, and further ones are closed
 SECURITY_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self'; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
@@ -59,14 +61,15 @@ class Page(ThreadingHTTPServer):
         self._result: Result | None = None
         self._fresh = threading.Condition()
         self._host = host
-        self._free = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        self._free, self._told = (threading.BoundedSemaphore(MAX_CONNECTIONS) for _ in range(2))
+        self.address_family = address_family(host)
         super().__init__((host, port), _Handler)
         self._thread = threading.Thread(target=self.serve_forever, args=(0.1,), daemon=True)
 
     @property
     def url(self) -> str:
         """Address of the page."""
-        return f"http://{self._host}:{self.server_address[1]}/"
+        return f"http://{host_and_port(self._host, self.server_address[1])}/"
 
     @property
     def host_names(self) -> set[str] | None:
@@ -75,7 +78,7 @@ class Page(ThreadingHTTPServer):
         A server on this machine only refuses other names, so that no foreign web page can reach it by DNS rebinding.
         """
         port = self.server_address[1]
-        return {f"{name}:{port}" for name in LOOPBACK} if self._host in LOOPBACK else None
+        return {host_and_port(name, port) for name in LOOPBACK} if self._host in LOOPBACK else None
 
     def show_result(self, result: Result) -> None:
         """Hand over the newest result; returns at once, and viewers take the result when they are ready."""
@@ -94,21 +97,24 @@ class Page(ThreadingHTTPServer):
         return 0 if self._result is None else self._result.number
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Handle a connection in a thread of its own, or close it if `MAX_CONNECTIONS` are open."""
-        if self._free.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
+        """Handle a connection in a thread of its own, or refuse it if `MAX_CONNECTIONS` are open."""
+        for room, handler in ((self._free, _Handler), (self._told, _FullHandler)):
+            if room.acquire(blocking=False):
+                work = (request, client_address, room, handler)
+                threading.Thread(target=self._handle, args=work, daemon=True).start()
+                return
+        self.shutdown_request(request)
 
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
+    def _handle(
+        self, request: Any, client_address: Any, room: threading.BoundedSemaphore, handler: "type[_Handler]"
+    ) -> None:
         """Handle a connection, then make room for another."""
         try:
-            super().process_request_thread(request, client_address)
+            with contextlib.suppress(Exception):  # print nothing when a viewer disconnects
+                handler(request, client_address, self)
         finally:
-            self._free.release()
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Print nothing when a viewer disconnects."""
+            self.shutdown_request(request)
+            room.release()
 
     def __enter__(self) -> "Page":
         self._thread.start()
@@ -191,3 +197,14 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: object) -> None:
         """Log nothing."""
+
+
+class _FullHandler(_Handler):
+    """Refuses each request, because `MAX_CONNECTIONS` are open."""
+
+    def do_GET(self) -> None:
+        """Say that there are too many viewers."""
+        explanation = f"{MAX_CONNECTIONS} viewers are connected; close one of their pages, and load this one again"
+        self.send_error(HTTPStatus.SERVICE_UNAVAILABLE, explain=explanation)
+
+    do_POST = do_GET

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ..calibration.calibration import Calibration
 from ..calibration.logs.calibration import LogCalibration
-from ..record.broadcast import Broadcaster
+from ..record.broadcast import Broadcaster, host_and_port
 from ..record.plan import RecordingPlan
 from ..record.recorder import session_journal
 from ..record.sources import Source
@@ -78,7 +78,7 @@ def present(
         if where.publish is not None:
             with _named("--publish", where.host, where.publish):
                 lines = stack.enter_context(Broadcaster(where.host, where.publish))
-            tell(f"lines of JSON at {lines.address[0]}:{lines.address[1]}")
+            tell(f"lines of JSON at {host_and_port(*lines.address)}")
             shape = calibration.recon.shape if where.maps and isinstance(calibration, Calibration) else ()
             viewers.append(lambda result: lines.publish([_line(result, shape)]))
         if where.host not in LOOPBACK:
@@ -94,7 +94,9 @@ def _named(option: str, host: str, port: int) -> Iterator[None]:
         yield
     except (OSError, OverflowError) as error:
         why = str(getattr(error, "strerror", None) or error).partition(" (while attempting")[0]
-        raise OSError(f"{option}: {host}:{port}: {why}; name another port (0: any free one) or --host") from None
+        raise OSError(
+            f"{option}: {host_and_port(host, port)}: {why}; name another port (0: any free one) or --host"
+        ) from None
 
 
 def _line(result: Result, shape: tuple[int, ...]) -> bytes:

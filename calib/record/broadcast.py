@@ -10,6 +10,16 @@ MAX_LISTENERS = 32  # at one time; the connections beyond are closed
 MAX_ACCEPTED = 100  # connections accepted in one call, so that a flood of connections does not hold up the frames
 
 
+def address_family(host: str) -> socket.AddressFamily:
+    """The family of an address to listen on: names and numbers with points are IPv4, numbers with colons IPv6."""
+    return socket.AF_INET6 if ":" in host else socket.AF_INET
+
+
+def host_and_port(host: str, port: int) -> str:
+    """An address as URLs write it: 127.0.0.1:8765, [::1]:8765."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
 class Listener:
     """One receiver of packets. Packets are sent whole, or dropped while too many bytes wait."""
 
@@ -49,7 +59,7 @@ class Broadcaster:
     """A TCP server that sends packets to all clients; a context manager. Raises OSError if the port is in use."""
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, backlog: int = MAX_BACKLOG):
-        self._server = socket.create_server((host, port))
+        self._server = socket.create_server((host, port), family=address_family(host))
         self._server.setblocking(False)
         self._backlog = backlog
         self.address: tuple[str, int] = self._server.getsockname()[:2]

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .broadcast import Broadcaster, Listener, send_to_all
+from .broadcast import Broadcaster, Listener, host_and_port, send_to_all
 from .sources import session_packets
 from .wire.encoding import encode_frame, encode_pong, parse_requests, select_readings
 
@@ -126,7 +126,7 @@ class SimulatedDevice:
     def _server(self, stack: contextlib.ExitStack, port: int) -> Callable[[int, Packets], None]:
         server = stack.enter_context(Broadcaster(self._host, port))
         host, port = server.address
-        self.urls.append(f"tcp://{host}:{port}")
+        self.urls.append(f"tcp://{host_and_port(host, port)}")
         return lambda number, stream: self._stream(
             number, stream, server.listeners, lambda: server.accept(self._unplugged.is_set())
         )

@@ -337,6 +337,16 @@ def test_the_server_listens_on_this_machine_only():
     assert address.startswith("0100007F:")
 
 
+def test_the_address_of_a_server_on_ipv6_is_one_that_programs_take():
+    pytest.importorskip("foxglove")
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        pytest.skip("no IPv6 on this machine")
+    with FoxgloveServer("::1", port=0) as server:
+        assert re.fullmatch(r"ws://\[::1\]:\d+", server.address)
+
+
 def test_lost_clients_of_foxglove_are_one_line(caplog):
     pytest.importorskip("foxglove")
     said = []

@@ -38,7 +38,7 @@ from calib.live.page import MAX_CONNECTIONS, Page
 from calib.live.presentation import Presentation, present
 from calib.live.results import TouchEstimates
 from calib.live.scan_control import ScanDirector, prepare_director
-from calib.record.broadcast import MAX_LISTENERS, Broadcaster
+from calib.record.broadcast import MAX_LISTENERS, Broadcaster, host_and_port
 from calib.record.device import SimulatedDevice, frame_packets, recording_packets
 from calib.record.plan import StreamPlan
 from calib.record.planning import plan_recording
@@ -888,6 +888,33 @@ def test_a_flood_of_connections_leaves_the_viewers_there_are(page, monkeypatch):
     for client in flood:
         client.close()
     link.close()
+
+
+def test_a_viewer_beyond_the_limit_is_told_so(page, monkeypatch):
+    monkeypatch.setattr(page.RequestHandlerClass, "timeout", 60.0)
+    first = [socket.create_connection(page.server_address[:2], timeout=20) for _ in range(MAX_CONNECTIONS)]
+    link, reply, body = fetch(page, "/")
+    assert reply.status == 503
+    assert b"32 viewers are connected; close one of their pages" in body
+    for one in (*first, link):
+        one.close()
+
+
+def test_the_page_and_the_lines_listen_on_ipv6(calibration):
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        pytest.skip("no IPv6 on this machine")
+    with Page(calibration, LiveControl(), "::1") as page, Broadcaster("::1") as lines:
+        port = page.server_address[1]
+        assert page.url == f"http://[::1]:{port}/"
+        link, reply, _ = fetch(page, "/scene", headers={"Host": f"[::1]:{port}"})
+        assert reply.status == 200
+        link.close()
+        with socket.create_connection(lines.address, timeout=5) as client:
+            lines.publish([b"1\n"])
+            assert client.recv(2) == b"1\n"
+    assert host_and_port(*lines.address) == f"[::1]:{lines.address[1]}"
 
 
 def test_a_flood_of_listeners_leaves_those_there_are():

@@ -203,6 +203,8 @@ def test_a_journal_is_not_overwritten_nor_read_while_it_grows(tmp_path):
         out.append(PLAN, 0, 0, b"")
         with pytest.raises(JournalError, match="still being recorded"):
             JournalReader(tmp_path / "j")
+        with pytest.raises(JournalError, match="still being recorded; give another name"):
+            Journal(tmp_path / "j")
     with pytest.raises(JournalError, match="jaxeit recover"):
         Journal(tmp_path / "j")
     with pytest.raises(JournalError, match="cannot be written"):

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
+from ...record.broadcast import host_and_port
 from ...session.errors import printable
 from ...session.importers.child import library
 from .bridge import AbstractLiveSink
@@ -56,10 +57,11 @@ class FoxgloveServer(AbstractLiveSink):
                     name=self._name, host=self._host, port=self._port, context=self._context
                 )
             except (RuntimeError, OverflowError) as error:
-                raise OSError(f"--foxglove: {self._host}:{self._port}: {error}; name another port") from error
+                where = host_and_port(self._host, self._port)
+                raise OSError(f"--foxglove: {where}: {error}; name another port") from error
             opened.callback(self._server.stop)
             self._close = opened.pop_all().close
-        self.address = f"ws://{self._host}:{self._server.port}"
+        self.address = f"ws://{host_and_port(self._host, self._server.port)}"
         return self
 
     def __exit__(self, *error: object) -> None:

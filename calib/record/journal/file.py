@@ -56,6 +56,18 @@ def _checksum(salt: bytes, head: bytes, payload: bytes | memoryview) -> int:
     return zlib.crc32(payload, zlib.crc32(head, zlib.crc32(salt)))
 
 
+def _is_locked(file: BinaryIO) -> bool:
+    """Whether the journal is still being written. If not, it is locked against that while the file is open."""
+    if fcntl is not None:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:  # the file system has no locks
+            pass
+    return False
+
+
 class Journal:
     """A new journal, to which several threads may append; use it as a context manager, or close it.
 
@@ -79,8 +91,7 @@ class Journal:
         try:
             file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o666)
         except FileExistsError:
-            todo = f"finish it first: jaxeit recover {self.path}"
-            raise JournalError(f"{self.path.name}: holds an unfinished recording; {todo}") from None
+            raise JournalError(f"{self.path.name}: {self._occupant()}") from None
         except OSError as error:
             raise self._problem(error) from error
         if fcntl is not None:
@@ -89,6 +100,13 @@ class Journal:
         with contextlib.suppress(OSError):  # sync the name of the file too; some systems cannot sync a folder
             sync(self.path.parent)
         return file
+
+    def _occupant(self) -> str:
+        """What lies at the path, and what to do about it."""
+        with contextlib.suppress(OSError), open_regular(self.path) as file:
+            if _is_locked(file):
+                return "is still being recorded; give another name, or stop that recording first"
+        return f"holds an unfinished recording; finish it first: jaxeit recover {self.path}"
 
     def _problem(self, error: OSError) -> JournalError:
         why = error.strerror or type(error).__name__
@@ -182,14 +200,9 @@ class JournalReader:
             file = open_regular(self.path)
         except OSError as error:
             raise JournalError(f"{self.path.name}: {error.strerror}; name a .part file") from error
-        if fcntl is not None:
-            try:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            except BlockingIOError:
-                file.close()
-                raise JournalError(f"{self.path.name}: is still being recorded; stop the recording first") from None
-            except OSError:  # the file system has no locks
-                pass
+        if _is_locked(file):
+            file.close()
+            raise JournalError(f"{self.path.name}: is still being recorded; stop the recording first")
         return file
 
     def _read_head(self, file: BinaryIO) -> bytes:
