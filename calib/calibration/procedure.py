@@ -23,6 +23,7 @@ from ..fitting.response import (
     require_every_pad_pressed,
 )
 from ..fitting.unpressed_walls import unpressed_note
+from ..presses.contradictions import contradicted_presses
 from ..presses.pooled import PooledPresses, pool_presses
 from ..presses.skins import differing_parts
 from ..presses.table import PressMeasurements, Processing, measure
@@ -183,6 +184,7 @@ def _notes(found: _Found) -> tuple[str, ...]:
         *found.imager.notes,
         *([f"chosen: {choice.why}"] if choice.why else []),
         *_not_predicted(found.skin, found.held_out.pad_force),
+        *contradicted_presses(presses, found.held_out.pad_force.sum(1), found.images.estimated.get("fitted")),
         *filter(None, [unpressed]),
     )
 

@@ -1,6 +1,8 @@
 """From a simulated bench to newtons and back, and what is said when something is wrong."""
 
 import multiprocessing
+import re
+import shutil
 import sys
 import time
 from dataclasses import replace
@@ -28,6 +30,7 @@ from calib.fitting.curves import CURVES
 from calib.fitting.curves.play_operators import play, remembered
 from calib.fitting.fields import Places, geometry_of
 from calib.fitting.pads import LocatedPresses, fit_pads
+from calib.presses.contradictions import contradicted_presses
 from calib.presses.pooled import pool_presses
 from calib.presses.table import measure
 from calib.report import document as report
@@ -82,6 +85,36 @@ def test_saved_and_loaded_it_is_the_same(calibration, folder):
     first, second = (calib.force_map(c, dv, pressures) for c in (calibration, loaded))
     np.testing.assert_array_equal(first.map.force, second.map.force)
     np.testing.assert_array_equal(first.standard_error, second.standard_error)
+
+
+def test_a_press_that_the_others_contradict_is_named(calibration, grid, tmp_path):
+    """A log of the stage with a slip in one force: 60 % more than its pressure tells."""
+    assert not any("contradict" in note for note in calibration.notes)
+    path = tmp_path / "slip.h5"
+    shutil.copy(grid, path)
+    with h5py.File(path, "r+") as file:
+        table, cell = file["presses"], file["streams/force"]
+        during = (cell["time"][:] >= table["t_press"][5]) & (cell["time"][:] <= table["t_release"][5])
+        cell["force"][...] = np.where(during[:, None], 1.6 * cell["force"][:], cell["force"][:])
+    with calib.open_session(path) as session:
+        notes = calib.calibrate(session, recipe=QUICK).notes
+    (named,) = [note for note in notes if "contradict" in note]
+    assert re.search(
+        r"^slip.h5: the other presses contradict the force of press 5: [\d.]+ N stated, [\d.]+ N by", named
+    )
+
+
+def test_contradicted_places_and_many_contradictions(skin, grid):
+    with calib.open_session(grid) as session:
+        pooled = pool_presses([session], skin)
+    exact, near = pooled.data.force, pooled.position + 1e-3 * np.sin(np.arange(32.0)).reshape(16, 2)
+    assert contradicted_presses(pooled, exact, near) == ()
+    assert contradicted_presses(pooled, np.full(16, np.nan), np.full((16, 2), np.nan)) == ()
+    elsewhere = np.where(np.arange(16)[:, None] == 7, near[::-1], near)
+    (line,) = contradicted_presses(pooled, exact, elsewhere)
+    assert f"the place of press 7: ({1e3 * pooled.position[7, 0]:.0f}, " in line
+    others = exact * np.where(np.arange(16) % 4, 1.0, 2.0)  # a quarter of the presses: then the fit is to blame
+    assert contradicted_presses(pooled, others) == ()
 
 
 @pytest.mark.parametrize("curve", [calib.PowerLaw(), calib.Affine()], ids=lambda c: type(c).__name__)
