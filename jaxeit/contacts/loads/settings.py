@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from ...effects import EFFECTS, ContactPiezoresistance
+from ...imaging.absolute.background import COATING_LENGTH, COATING_STD
 from ...imaging.noise import InverseError
 
-KNOWN_COAT, UNKNOWN_COAT = 0.0, 0.15
 POSITIVE = (
     *("gain_length", "texture_length", "coat_length", "width", "width_spread", "force", "force_spread"),
     *("width_difference", "force_difference", "length", "nearest", "shortest"),
@@ -99,7 +99,7 @@ class LoadSettings:
     texture: float = 0.0
     texture_length: float = 0.0075
     coat: float | None = None
-    coat_length: float = 0.03
+    coat_length: float = COATING_LENGTH
     shape: float = 0.1
     shapes: tuple[float, ...] = (0.0, 1.0, 2.0, 4.0, 8.0)
     model_error: float = 0.005
@@ -147,5 +147,5 @@ class LoadSettings:
 
     def coat_spread(self, known: bool) -> float:
         """Standard deviation of the log conductivity that the sheet is not known by."""
-        default = KNOWN_COAT if known else UNKNOWN_COAT
+        default = 0.0 if known else COATING_STD
         return default if self.coat is None else self.coat

@@ -1,7 +1,6 @@
 """The conductivity of an untouched sheet, from a frame of it."""
 
 from collections.abc import Callable
-from inspect import signature
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,6 +19,11 @@ from ..noise import InverseError, require_real
 from ..priors import AbstractPrecision, GaussianSmooth
 from .images import ImagePosterior, LogConductivity, Quadratic, most_probable, reading_weights
 
+# What is believed of a real coating: standard deviation of the logarithm of its conductivity, distance over which it
+# varies, m, and pixels of it along x, of less than half that distance on a skin of 0.2 m.
+COATING_STD, COATING_LENGTH, COATING_COLUMNS = 0.15, 0.03, 20
+# Relative error of a reading, from mesh, electrodes and current as they are modelled, and tolerance of the fit.
+COATING_ERROR, TOLERANCE = 1e-2, 2e-3
 # Smallest error of a reading, as a fraction of the root mean square of all: no reading is modelled better.
 ERROR_FLOOR = 1e-3
 # Steps of the fit, and share of the variance of its error that is kept.
@@ -33,12 +37,12 @@ def fit_background(
     model: Model,
     v0: Float[ArrayLike, " readings"],
     *,
-    std: Float[ArrayLike, ""] = 0.15,
-    length: Float[ArrayLike, ""] = 0.03,
-    model_error: Float[ArrayLike, ""] = 0.01,
-    columns: int = 20,
+    std: Float[ArrayLike, ""] = COATING_STD,
+    length: Float[ArrayLike, ""] = COATING_LENGTH,
+    model_error: Float[ArrayLike, ""] = COATING_ERROR,
+    columns: int = COATING_COLUMNS,
     basis: BasisMap | None = None,
-    tolerance: float = 2e-3,
+    tolerance: float = TOLERANCE,
 ) -> Float[Array, " elements"]:
     """Estimate the conductivity, (elements,) S, of the untouched sheet from one frame; for ``sigma=`` of `prepare` and
     `prepare_contacts`.
@@ -112,10 +116,8 @@ def fitted_sheet(model: Model, v0: Float[Array, " readings"]) -> UntouchedSheet:
     Raises:
         InverseError: as for `fit_background`.
     """
-    usual = {name: each.default for name, each in signature(fit_background).parameters.items()}
-    physics = even_coat(model, v0, Pixels(usual["columns"]).on(model))
-    names = ("std", "length", "model_error", "tolerance")
-    sigma, precision = _fitted(physics, v0, *(usual[name] for name in names))
+    physics = even_coat(model, v0, Pixels(COATING_COLUMNS).on(model))
+    sigma, precision = _fitted(physics, v0, COATING_STD, COATING_LENGTH, COATING_ERROR, TOLERANCE)
     values, vectors = np.linalg.eigh(np.asarray(precision, float))  # ascending: the largest variances first
     share = np.cumsum(1 / values) / np.sum(1 / values)
     count = 1 + int(np.searchsorted(share, ERROR_VARIANCE))

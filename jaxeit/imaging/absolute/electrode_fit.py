@@ -35,7 +35,7 @@ from ...registry import AbstractChoice, limited
 from ...registry.limits import LONGEST
 from ..noise import InverseError, require_real
 from ..priors import GaussianSmooth
-from .background import frame_error, require_frame, sheet_level
+from .background import COATING_LENGTH, COATING_STD, frame_error, require_frame, sheet_level
 from .images import AbstractPosterior, most_probable, reading_weights
 
 STRENGTH_STD = 1.0  # of the logarithm of a press's strength, whose first value comes from its readings
@@ -58,8 +58,8 @@ class ElectrodeFitSettings(AbstractChoice):
     """
 
     shift: float = limited(1e-3, above=0, most=LONGEST)
-    coat_std: float = limited(0.15, above=0)
-    coat_length: float = limited(0.03, above=0, most=LONGEST)
+    coat_std: float = limited(COATING_STD, above=0)
+    coat_length: float = limited(COATING_LENGTH, above=0, most=LONGEST)
     gain_std: float = limited(0.12, above=0)
     gain_length: float = limited(0.015, above=0, most=LONGEST)
     width: float = limited(0.012, above=0, most=LONGEST)

@@ -29,12 +29,18 @@ from ...model.forward_model import coefficients, fields, terminal_matrix, voltag
 from ...model.motion import Motion, electrode_motion, field_shift_jacobian
 from ...model.sensitivity import field_jacobian
 from ..noise import InverseError, real_numbers, require_real
-from .background import coat_precision, even_coat, frame_error
+from .background import (
+    COATING_COLUMNS,
+    COATING_ERROR,
+    COATING_LENGTH,
+    COATING_STD,
+    coat_precision,
+    even_coat,
+    frame_error,
+)
 from .images import LogConductivity, Quadratic, gauss_newton
 
-COAT_LENGTH, COAT_COLUMNS = 0.03, 20  # m, over which a coat varies; pixels of it along x
-USUAL_COAT, COAT_SPREAD = 0.15, 0.7  # of the logarithm of the conductivity, and of the logarithm of that
-COAT_ERROR = 1e-2  # relative error of a reading, by which the coat is found that all is linear about
+COAT_SPREAD = 0.7  # of the logarithm of the deviation of the coat
 MODEL_ERROR = 1e-3  # relative, of which e is a multiple
 LEAST_ERROR = 0.1  # e: derivatives hold no better
 MOST_COAT, MOST_SHIFT = 1.0, 5e-3  # c, and s in m; beyond them, derivatives say nothing of a size
@@ -87,9 +93,9 @@ def find_misplacement(
     require_known("find_misplacement", InverseError, model.nodes, v0, noise)
     require_real(v0=v0)
     frame = jnp.asarray(v0, model.dtype)
-    physics = even_coat(model, frame, Pixels(COAT_COLUMNS).on(model))
-    penalty = Quadratic(coat_precision(physics.image, COAT_LENGTH), 1 / jnp.asarray(USUAL_COAT) ** 2)
-    coat = gauss_newton(physics, penalty, frame, frame_error(frame, COAT_ERROR))
+    physics = even_coat(model, frame, Pixels(COATING_COLUMNS).on(model))
+    penalty = Quadratic(coat_precision(physics.image, COATING_LENGTH), 1 / jnp.asarray(COATING_STD) ** 2)
+    coat = gauss_newton(physics, penalty, frame, frame_error(frame, COATING_ERROR))
     linear = _linear(physics, electrode_motion(model), coat)
     error = np.asarray(frame_error(frame, MODEL_ERROR), float)
     spread = np.zeros_like(error) if noise is None else real_numbers("noise", noise, "V")
@@ -120,7 +126,7 @@ def _linear(
     by_coat = field_jacobian(model, theta, x, physics.image, sigma)
     by_shift = field_shift_jacobian(model, motion, theta, x)
     found = voltages(model, terminal_matrix(model, theta, x))
-    parts = coat_precision(physics.image, COAT_LENGTH).seen(by_coat)
+    parts = coat_precision(physics.image, COATING_LENGTH).seen(by_coat)
     return parts, by_shift.reshape(len(by_shift), -1), found - by_coat @ coat, found
 
 
@@ -191,7 +197,7 @@ def _beliefs(
     square = y @ y - (SHIFTS[:, None] ** 2 / (1 + told)) @ towards**2
     error = np.sqrt(np.maximum(square / len(y), LEAST_ERROR**2))
     surprise = len(y) * np.log(error) + 0.5 * (square / error**2 + np.log1p(told).sum(1)) + root
-    surprise += 0.5 * (np.log(ratio * error / USUAL_COAT) / COAT_SPREAD) ** 2
+    surprise += 0.5 * (np.log(ratio * error / COATING_STD) / COAT_SPREAD) ** 2
     size = SHIFTS * error
     surprise = np.where((ratio * error > MOST_COAT) | (size > MOST_SHIFT), np.inf, surprise)
 
