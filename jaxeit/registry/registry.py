@@ -146,11 +146,12 @@ class Registry(Mapping[str, type[T]], Generic[T]):
                 f"or install it with an entry point of the group {self.group!r}"
             )
         try:
-            return functools.reduce(getattr, attribute.split("."), importlib.import_module(module))
-        except Exception as error:  # a user's module may raise anything
-            raise RegistryError(
-                f"{self.kind} {path!r} cannot be imported ({_one_line(error)}); check the path and PYTHONPATH"
-            ) from None
+            return functools.reduce(getattr, attribute.split("."), _imported(module))
+        except (ModuleNotFoundError, AttributeError) as error:
+            why, todo = _one_line(error), "check the path and PYTHONPATH"
+        except _ModuleError as error:
+            why, todo = str(error), "correct that module"
+        raise RegistryError(f"{self.kind} {path!r} cannot be imported ({why}); {todo}")
 
     def _checked(self, thing: Any, name: str) -> type[T]:
         if not self._is_choice(thing):
@@ -210,8 +211,29 @@ def kebab_case(name: str) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "-", name).lower()
 
 
-def _one_line(error: Exception) -> str:
+class _ModuleError(Exception):
+    """A module is there and raises when it is imported; the message is what it raises."""
+
+
+def _imported(module: str) -> Any:
+    """The module of this name; raises ModuleNotFoundError if it is not there, and `_ModuleError` if it raises."""
+    if not all(part.isidentifier() for part in module.split(".")):
+        raise ModuleNotFoundError(f"No module named {module!r}")
+    try:
+        return importlib.import_module(module)
+    except (Exception, SystemExit) as error:  # a user's module may raise anything
+        if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
+            raise
+        raise _ModuleError(f"{module} raises {_with_type(error)}") from None
+
+
+def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
+
+
+def _with_type(error: BaseException) -> str:
+    name = type(error).__name__
+    return f"{name}: {said}" if (said := _one_line(error)) != name else name
 
 
 def _made(kind: type[T], table: TomlTable, given: Mapping[str, Any], parts: tuple[Part, ...]) -> T:
@@ -239,7 +261,8 @@ def _loaded(point: EntryPoint, kind: str) -> Any:
     try:
         return point.load()
     except Exception as error:  # another package may raise anything
-        raise RegistryError(f"{kind} {point.name!r}: {point.value} cannot be loaded ({_one_line(error)})") from None
+        why = _one_line(error) if isinstance(error, ImportError | AttributeError) else _with_type(error)
+        raise RegistryError(f"{kind} {point.name!r}: {point.value} cannot be loaded ({why})") from None
 
 
 def split_word(text: str) -> tuple[str, dict[str, Any]]:

@@ -172,8 +172,31 @@ def test_import_paths_of_no_use_are_named(own, path, message):
 
 def test_modules_that_fail_are_named(own, tmp_path):
     (tmp_path / f"{own}.py").write_text("raise RuntimeError('two\\nlines')")
-    with pytest.raises(ValueError, match=f"effect '{own}:Twice' cannot be imported .two lines.; check the path"):
+    said = f"^effect '{own}:Twice' cannot be imported \\({own} raises RuntimeError: two lines\\); correct that module$"
+    with pytest.raises(ValueError, match=said):
         EFFECTS.find(f"{own}:Twice", allow_import=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("def x(:", "raises SyntaxError: invalid syntax .*, line 1"),
+        ("import no_such_module_there", "raises ModuleNotFoundError: No module named 'no_such_module_there'"),
+        ("assert False", r"raises AssertionError\); correct that module"),
+        ("import sys; sys.exit(3)", r"raises SystemExit: 3\); correct that module"),
+        ("import math; math.no_such_name", "raises AttributeError: module 'math' has no"),
+    ],
+)
+def test_what_a_module_raises_is_said_with_its_type(own, tmp_path, text, said):
+    (tmp_path / f"{own}.py").write_text(text)
+    with pytest.raises(ValueError, match=f"cannot be imported .{own} {said}"):
+        EFFECTS.find(f"{own}:Twice", allow_import=True)
+
+
+@pytest.mark.parametrize("path", [":Twice", "..effects:Twice", "my effects:Twice"])
+def test_what_is_no_name_of_a_module_is_not_there(path):
+    with pytest.raises(ValueError, match=r"cannot be imported \(No module named .*; check the path and PYTHONPATH"):
+        EFFECTS.find(path, allow_import=True)
 
 
 def test_installed_classes_are_known_by_their_entry_point(own, monkeypatch):

@@ -384,6 +384,14 @@ def test_a_format_of_the_user_is_named_by_its_import_path(tmp_path, capsys):
     assert "--rate" in capsys.readouterr().out
 
 
+def test_a_module_of_a_format_that_raises_is_named(tmp_path, monkeypatch, capsys):
+    (tmp_path / "broken_format.py").write_text("raise ValueError('no\\nway')")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert main(["import", "broken_format:Format", "log.txt", "-o", "s.h5"]) == 2
+    said = "'broken_format:Format' cannot be imported (ValueError: no?way); correct its module"
+    assert said in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("path", "message"),
     [

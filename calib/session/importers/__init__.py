@@ -132,9 +132,12 @@ def find_importer(name: str) -> type[AbstractImporter]:
         return importers()[name]
     try:
         kind = pkgutil.resolve_name(name)
-    except Exception as error:  # a user's module may raise anything
+    except (ModuleNotFoundError, AttributeError) as error:
         why = printable(error, 200)
         raise SessionError(f"import format {name!r} cannot be imported ({why}); check path and PYTHONPATH") from None
+    except (Exception, SystemExit) as error:  # a user's module may raise anything
+        why = f"{type(error).__name__}: {printable(error, 200)}"
+        raise SessionError(f"import format {name!r} cannot be imported ({why}); correct its module") from None
     if not (isclass(kind) and issubclass(kind, AbstractImporter)) or isabstract(kind):
         raise SessionError(f"import format {name!r} is not a concrete class derived from {AbstractImporter.__name__}")
     return kind
