@@ -1,5 +1,6 @@
 """EIT images, force maps and contacts of some presses, over the outlines of sheet and pads."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,14 +17,20 @@ if TYPE_CHECKING:
 
 
 class ExampleMaps:
-    """Images (n, pixels) S, force maps (n, pixels) N and contacts of a calibration's examples."""
+    """Images (n, pixels) S, force maps (n, pixels) N and contacts of a calibration's examples.
+
+    An example is a press with one tip: one contact is looked for, as in the fit. The search for several would be
+    another program, which takes seconds to compile.
+    """
 
     def __init__(self, calibration: Calibration):
         shown, recon = calibration.examples, calibration.recon
         assert shown is not None
         self.calibration, self.shown = calibration, shown
         self.image = np.asarray(recon(np.asarray(shown.dv, recon.dtype)))
-        self.force = np.asarray(force_map(calibration, shown.dv, shown.pressure).map.force)
+        locator = None if calibration.locator is None else calibration.locator.single()
+        of_one = replace(calibration, locator=locator)
+        self.force = np.asarray(force_map(of_one, shown.dv, shown.pressure).map.force)
         self.contacts = example_contacts(calibration, self.image)
         self.larger = self.contacts.magnification(calibration.skin)
 
