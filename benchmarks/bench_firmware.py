@@ -18,7 +18,7 @@ import numpy as np
 
 import calib
 import jaxeit as je
-from calib.calibration.force_maps import law_of
+from calib.calibration.force_maps import force_model
 from calib.live.engine import FramePrograms
 
 from .bench_live import made_up
@@ -92,7 +92,7 @@ def calibration_of(pixels: int) -> calib.Calibration:
 def measured(calibration: calib.Calibration, folder: Path, calls: int) -> Iterator[Row]:
     """A row for each part of a frame: medians over rounds, microseconds. The header is in the folder."""
     readings, pads = calibration.recon.readings, len(calibration.skin.pads)
-    programs, image = FramePrograms(law_of(calibration)), calibration.recon.on_host("float32")
+    programs, image = FramePrograms(force_model(calibration)), calibration.recon.on_host("float32")
     frame = (1e-6 * (np.arange(readings) % 7)).astype("f4")
     lost = np.where(np.arange(readings) == readings // 2, np.nan, frame).astype("f4")
     pressure, before = np.full(pads, 1000.0), np.zeros((1, pads))

@@ -56,7 +56,7 @@ class ForceEstimate(NamedTuple):
     total_error: Any
 
 
-class ForceLaw(eqx.Module):
+class ForceModel(eqx.Module):
     """The parts of a `Calibration` from which forces are computed, as one pytree for compiled programs."""
 
     recon: je.Reconstructor | je.imaging.IterativeReconstructor
@@ -69,15 +69,15 @@ class ForceLaw(eqx.Module):
         """Whether forces depend on the pressures that came before."""
         return self.pads.curves.curve.path
 
-    def moved(self, gains: PadGains | None) -> "ForceLaw":
-        """The law with these gains of the pads."""
+    def moved(self, gains: PadGains | None) -> "ForceModel":
+        """The model with these gains of the pads."""
         return replace(self, pads=replace(self.pads, gains=gains))
 
 
-def law_of(calibration: Calibration) -> ForceLaw:
+def force_model(calibration: Calibration) -> ForceModel:
     """The parts of a calibration from which forces are computed."""
     c = calibration
-    return ForceLaw(c.recon, c.masks, c.pads, c.locator)
+    return ForceModel(c.recon, c.masks, c.pads, c.locator)
 
 
 def force_map(
@@ -108,15 +108,15 @@ def force_map(
     if not len(frames):  # programs are of one row at least
         row = force_map(calibration, np.zeros((1, frames.shape[1])), np.zeros((1, pressures.shape[1])), gate=gate)
         return first_rows(row, 0)
-    law = law_of(calibration)
-    frames = jnp.asarray(frames, law.recon.dtype)
-    pressures = jnp.asarray(pressures, law.pads.dtype)
-    earlier = filled(law, before)
-    image, places = law.recon(frames), None
-    if law.locator is not None:
-        touched = jnp.any(is_loaded(law, pressures), 1, keepdims=True)
-        places = locate(law.locator, jnp.where(touched, frames, 0), law.recon, law.masks, image)
-    found = _fused(law, image, pressures, places, None if earlier is None else jnp.asarray(earlier), gate)
+    model = force_model(calibration)
+    frames = jnp.asarray(frames, model.recon.dtype)
+    pressures = jnp.asarray(pressures, model.pads.dtype)
+    earlier = filled(model, before)
+    image, places = model.recon(frames), None
+    if model.locator is not None:
+        touched = jnp.any(is_loaded(model, pressures), 1, keepdims=True)
+        places = locate(model.locator, jnp.where(touched, frames, 0), model.recon, model.masks, image)
+    found = _fused(model, image, pressures, places, None if earlier is None else jnp.asarray(earlier), gate)
     return ForceEstimate(found.map, *map(np.asarray, found[1:]))
 
 
@@ -138,18 +138,18 @@ def first_rows(found: ForceEstimate, count: int) -> ForceEstimate:
     return cut._replace(map=replace(cut.map, areas=found.map.areas))
 
 
-def filled(law: ForceLaw, before: np.ndarray | None) -> np.ndarray | None:
+def filled(model: ForceModel, before: np.ndarray | None) -> np.ndarray | None:
     """Earlier pressures (m, pads) after rows of NaN, which have no effect; None for curves without memory."""
-    if before is None or not law.remembers:
+    if before is None or not model.remembers:
         return None
     # Lengths are rounded up to a few sizes, because each new length compiles the program again.
     first = bucket(len(before))
     rows = np.concatenate([np.full((first - len(before), before.shape[1]), np.nan), before])
-    return rows.astype(law.pads.dtype)
+    return rows.astype(model.pads.dtype)
 
 
 def fused(
-    law: ForceLaw,
+    model: ForceModel,
     image: Float[Array, "n pixels"],
     pressures: Float[Array, "n pads"],
     places: Places | None,
@@ -157,14 +157,16 @@ def fused(
     gate: float,
 ) -> ForceEstimate:
     """`force_map` from known images and places (None: places are not estimated); pure."""
-    force, error, valid, variance = law.pads.single(pressures, places, before)
+    force, error, valid, variance = model.pads.single(pressures, places, before)
     numbers, shares = (part.astype(image.dtype) for part in (force, error)), None
     if places is None:
         places = nowhere(pressures, 0)
     else:
-        shares = je.fusion.contact_shares(places.position, places.width, places.amplitude, law.recon.centres, law.masks)
+        shares = je.fusion.contact_shares(
+            places.position, places.width, places.amplitude, model.recon.centres, model.masks
+        )
     pad_force, pad_error = numbers
-    found = je.fuse(image, law.masks, pad_force, gate=gate, contacts=shares, pad_errors=pad_error)
+    found = je.fuse(image, model.masks, pad_force, gate=gate, contacts=shares, pad_errors=pad_error)
     of_contacts = _of_contacts(force, places, shares)
     return ForceEstimate(found, force, error, valid, places.position, of_contacts, jnp.sqrt(variance))
 
@@ -186,16 +188,18 @@ def _of_contacts(
     return jnp.einsum("np,nkp->nk", jnp.where(jnp.isfinite(force), force, 0), weight)
 
 
-def unmoved_forces(law: ForceLaw, pressures: Float[Array, "n pads"], places: Places | None) -> Float[Array, "n pads"]:
+def unmoved_forces(
+    model: ForceModel, pressures: Float[Array, "n pads"], places: Places | None
+) -> Float[Array, "n pads"]:
     """Force on each pad from the pressures that it would have read at the calibration; pure."""
-    return replace(law.pads, gains=None).forces(pressures, places).force
+    return replace(model.pads, gains=None).forces(pressures, places).force
 
 
 _LOADED_MULTIPLE = 3.0  # of the noise without force: noise rarely exceeds it, so that idle pads stay idle
 
 
 @je.verb
-def is_loaded(law: ForceLaw, pressures: Float[Array, "n pads"]) -> Bool[Array, "n pads"]:
+def is_loaded(model: ForceModel, pressures: Float[Array, "n pads"]) -> Bool[Array, "n pads"]:
     """Whether the force on a pad, without correction by location, exceeds the noise of an idle pad; pure."""
-    force = replace(law.pads, field=None).forces(pressures).force
-    return force > _LOADED_MULTIPLE * law.pads.idle_noise
+    force = replace(model.pads, field=None).forces(pressures).force
+    return force > _LOADED_MULTIPLE * model.pads.idle_noise

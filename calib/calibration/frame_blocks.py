@@ -12,7 +12,7 @@ from ..presses.streams import resample
 from ..presses.table import Processing
 from ..session import Session, SessionError, Stream
 from .calibration import Calibration
-from .force_maps import ForceEstimate, first_rows, force_map, is_loaded, law_of
+from .force_maps import ForceEstimate, first_rows, force_map, force_model, is_loaded
 
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
@@ -30,7 +30,7 @@ class FrameBlock(NamedTuple):
 
     def loaded(self, calibration: Calibration) -> np.ndarray:
         """Which frames are touched, (n,)."""
-        return np.array(is_loaded(law_of(calibration), jnp.asarray(self.pressed)).any(1))
+        return np.array(is_loaded(force_model(calibration), jnp.asarray(self.pressed)).any(1))
 
 
 class FrameBlocks:

@@ -22,7 +22,7 @@ import jaxeit as je
 from jaxeit.tracking import Track
 
 from ..calibration.calibration import Calibration
-from ..calibration.force_maps import ForceLaw, filled, fused, is_loaded, law_of
+from ..calibration.force_maps import ForceModel, filled, force_model, fused, is_loaded
 from ..calibration.localisation.ellipses import placement_covariance
 from ..calibration.localisation.locators import ContactLocator
 from ..check.placement import noted
@@ -124,23 +124,23 @@ class FramePrograms:
     program each. `warm_up` runs all of them once before the first frame arrives.
     """
 
-    def __init__(self, law: ForceLaw, followed: int | None = None):
+    def __init__(self, model: ForceModel, followed: int | None = None):
         """`followed`: largest number of contacts that a tracker tells; None: the calibration's locator tells them."""
-        self._law, self.gains = law, law.pads.gains
-        self._image = law.recon.on_host(IMAGE_DTYPE)
-        self._dtypes = law.recon.dtype, law.pads.dtype
-        # The numbers of the force law are constants of the program, which takes two thirds off the overhead of a call;
-        # only the gains of the pads may change while it runs.
-        self._map = _compiled(lambda gains, *a: _packed_forces(law.moved(gains), *a))
-        leaves, tree = jax.tree.flatten(law)
+        self._model, self.gains = model, model.pads.gains
+        self._image = model.recon.on_host(IMAGE_DTYPE)
+        self._dtypes = model.recon.dtype, model.pads.dtype
+        # The numbers of the model are constants of the program, which takes two thirds off the overhead of a call; only
+        # the gains of the pads may change while it runs.
+        self._map = _compiled(lambda gains, *a: _packed_forces(model.moved(gains), *a))
+        leaves, tree = jax.tree.flatten(model)
         search = _compiled(lambda leaves, *a: _find_contacts(jax.tree.unflatten(tree, leaves), *a))
         self._search = partial(search, leaves)  # not constants, because the table of responses takes megabytes
-        contacts = law.locator.finder.most if isinstance(law.locator, ContactLocator) else 1
+        contacts = model.locator.finder.most if isinstance(model.locator, ContactLocator) else 1
         self._followed = followed
         self.nowhere = nowhere(
-            jnp.zeros((1, law.masks.weights.shape[0]), self._dtypes[0]), contacts if followed is None else followed
+            jnp.zeros((1, model.masks.weights.shape[0]), self._dtypes[0]), contacts if followed is None else followed
         )
-        centres, masks = law.recon.centres, law.masks
+        centres, masks = model.recon.centres, model.masks
         self._shares = _compiled(
             lambda position, width, force: je.fusion.contact_shares(position, width, force, centres, masks).share
         )
@@ -148,11 +148,11 @@ class FramePrograms:
     @property
     def searches(self) -> bool:
         """Whether contacts are located frame by frame."""
-        return self._law.locator is not None and self._followed is None
+        return self._model.locator is not None and self._followed is None
 
     def warm_up(self) -> None:
         """Run all programs once, also for a frame without readings."""
-        readings, pads = self._law.recon.readings, self._law.masks.weights.shape[0]
+        readings, pads = self._model.recon.readings, self._model.masks.weights.shape[0]
         frame = np.zeros(readings)
         self.map(frame, np.zeros(pads), self.nowhere, np.zeros((1, pads)))
         self._image(np.full(readings, np.nan))
@@ -164,7 +164,7 @@ class FramePrograms:
     def map(self, frame: np.ndarray, pressure: np.ndarray, places: Places, before: np.ndarray) -> FrameForces:
         """Forces from a difference frame (readings,) V, pressures (pads,) Pa and those ``before`` (m, pads)."""
         image = self._image(frame)
-        row = self._map(self.gains, image[None], self._row(pressure, 1), places, filled(self._law, before))
+        row = self._map(self.gains, image[None], self._row(pressure, 1), places, filled(self._model, before))
         return _unpack_forces(np.asarray(row), pressure.size, image)
 
     def search(self, frame: np.ndarray) -> tuple[Places, TouchEstimates]:
@@ -175,7 +175,7 @@ class FramePrograms:
     def placed(self, tracks: tuple[Track, ...]) -> Places:
         """Places of contacts that are followed."""
         assert self._followed is not None
-        if self._law.pads.field is None:
+        if self._model.pads.field is None:
             return self.nowhere
         parts = [jnp.asarray(part, self._dtypes[0]) for part in padded(tracks, self._followed)]
         position, width, force = parts
@@ -189,11 +189,11 @@ def _compiled(function: Callable[..., T]) -> Callable[..., T]:
     return jax.jit(function, compiler_options=je.compiler_options())
 
 
-def _packed_forces(law: ForceLaw, image: Array, pressure: Array, places: Places, before: Array | None) -> Array:
+def _packed_forces(model: ForceModel, image: Array, pressure: Array, places: Places, before: Array | None) -> Array:
     """The fields of `FrameForces` in one row, so that one transfer from the device suffices."""
-    image = image.astype(law.recon.dtype)
-    found = fused(law, image, pressure, places if law.pads.field is not None else None, before, GATE)
-    loaded, negative = is_loaded(law, pressure), is_loaded(law, -pressure)
+    image = image.astype(model.recon.dtype)
+    found = fused(model, image, pressure, places if model.pads.field is not None else None, before, GATE)
+    loaded, negative = is_loaded(model, pressure), is_loaded(model, -pressure)
     parts = found.map.force, found.force, found.standard_error, found.valid, loaded, negative
     return jnp.concatenate([part[0].astype(found.force.dtype) for part in parts])
 
@@ -203,13 +203,13 @@ def _unpack_forces(row: np.ndarray, pads: int, image: np.ndarray) -> FrameForces
     return FrameForces(row[: -5 * pads], force, error, valid > 0, loaded > 0, negative > 0, image)
 
 
-def _find_contacts(law: ForceLaw, frame: Array) -> tuple[Places, je.Contacts | None]:
+def _find_contacts(model: ForceModel, frame: Array) -> tuple[Places, je.Contacts | None]:
     """Places, and the contacts from which they come; None for a locator that fits no contacts."""
-    if isinstance(law.locator, ContactLocator):
-        found = law.locator.finder(frame)
-        return law.locator.placed(found, law.recon, law.masks), found
-    assert law.locator is not None
-    return law.locator(frame, law.recon(frame), law.recon, law.masks), None
+    if isinstance(model.locator, ContactLocator):
+        found = model.locator.finder(frame)
+        return model.locator.placed(found, model.recon, model.masks), found
+    assert model.locator is not None
+    return model.locator(frame, model.recon(frame), model.recon, model.masks), None
 
 
 def _touch_estimates(found: je.Contacts) -> TouchEstimates:
@@ -261,8 +261,8 @@ class Engine:
         self._recalibrator, self._follower = recalibrator, follower
         self._doubt = noted(calibration.notes)
         self._multiple = calibration.pads.multiple
-        self._law = law_of(calibration) if recalibrator is None else recalibrator.moved(law_of(calibration))
-        self._programs = programs(self._law) if follower is None else programs(self._law, follower.most)
+        self._model = force_model(calibration) if recalibrator is None else recalibrator.moved(force_model(calibration))
+        self._programs = programs(self._model) if follower is None else programs(self._model, follower.most)
         self._programs.warm_up()
         self._before = np.zeros((1, len(self._pad_weights)))
         self._waiting_frame: np.ndarray | None = None  # a touched frame whose contacts are not fitted yet
@@ -381,8 +381,8 @@ class Engine:
 
     def _remember(self, pressure: np.ndarray) -> None:
         """Keep a pressure for a curve with memory."""
-        if self._law.remembers:
-            own = np.asarray(self._law.moved(self._programs.gains).pads.own(jnp.asarray(pressure[None])))
+        if self._model.remembers:
+            own = np.asarray(self._model.moved(self._programs.gains).pads.own(jnp.asarray(pressure[None])))
             self._before = remembered(np.concatenate([self._before, own]))
 
     def _kinds(self, frame: np.ndarray, force: np.ndarray, touched: bool) -> KindEstimate | None:

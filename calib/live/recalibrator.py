@@ -18,7 +18,7 @@ import numpy as np
 from jaxeit.tracking import LearnedLayer
 
 from ..calibration.calibration import Calibration
-from ..calibration.force_maps import ForceLaw
+from ..calibration.force_maps import ForceModel
 from ..calibration.recalibration.changes import Evidence, Recalibration
 from ..calibration.recalibration.ordinary_use import loaded_pressures
 from ..calibration.recalibration.press_noise import press_noise
@@ -139,9 +139,9 @@ class LiveRecalibrator:
             return "calibration health: not known before a few contacts on each pad"
         return self.record.health
 
-    def moved(self, law: ForceLaw) -> ForceLaw:
-        """A force law with the present gains."""
-        return law.moved(self.gains)
+    def moved(self, model: ForceModel) -> ForceModel:
+        """A force model with the present gains."""
+        return model.moved(self.gains)
 
     def add(self, voltage: np.ndarray, pressure: np.ndarray, loaded: bool, now: int) -> None:
         """Add a frame: changes of readings and pressures, already without `offset`, at `now` ns."""

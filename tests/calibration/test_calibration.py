@@ -22,7 +22,7 @@ import jaxeit as je
 from calib.bench import simulate
 from calib.calibration.archives.storage import SEAL, to_archive
 from calib.calibration.evaluation import render_table
-from calib.calibration.force_maps import fused, law_of
+from calib.calibration.force_maps import force_model, fused
 from calib.calibration.localisation.locators import ROWS, CentroidLocator, locate, locator_from_numbers, locator_numbers
 from calib.calibration.localisation.press_images import fit_untouched_sheet
 from calib.calibration.procedure import _not_predicted
@@ -261,13 +261,13 @@ def test_force_maps_sum_to_the_pads_and_know_their_limits(calibration):
 
 def test_contacts_share_what_their_pad_carries(located):
     """By the integrals of their bumps; one across the border of two pads has its part of both."""
-    law, recon = law_of(located), located.recon
+    forces, recon = force_model(located), located.recon
     position = jnp.array([[[0.03, 0.05], [0.075, 0.05]], [[0.1, 0.05], [jnp.nan, jnp.nan]]])
     width, amplitude = jnp.array([[0.01, 0.01], [0.01, jnp.nan]]), jnp.array([[3.0, 1.0], [1.0, 0.0]])
     share = je.fusion.contact_shares(position, width, amplitude, recon.centres, located.masks).share
     image = jnp.exp(-0.5 * jnp.sum((position[:, :1] - recon.centres) ** 2, -1) / 0.03**2)
     pressures = jnp.array([[1600.0, 0.0, 20.0, 20.0], [500.0, 500.0, 20.0, 20.0]])  # the others': crosstalk
-    found = eqx.filter_jit(fused)(law, image, pressures, Places(position, share, width, amplitude), None, 0.6)
+    found = eqx.filter_jit(fused)(forces, image, pressures, Places(position, share, width, amplitude), None, 0.6)
     np.testing.assert_allclose(found.map.force.sum(1), found.force.sum(1), rtol=1e-12)
     touched = jnp.array([[True, False, False, False], [True, True, False, False]])
     np.testing.assert_allclose(found.contact_force.sum(1), jnp.where(touched, found.force, 0).sum(1), rtol=1e-12)
@@ -282,24 +282,24 @@ def test_contacts_share_what_their_pad_carries(located):
 @pytest.mark.parametrize("part", [0.04, 0.07, 0.12])
 def test_no_force_of_pads_is_lost_between_contacts(located, part):
     """A contact that has a share of the map of a pad has the same share of the pad's force."""
-    law, width, amplitude = law_of(located), jnp.full((1, 2), 0.015), jnp.array([[2.0, 1.0]])
+    forces, width, amplitude = force_model(located), jnp.full((1, 2), 0.015), jnp.array([[2.0, 1.0]])
     position = jnp.array([[[0.1 + 0.015 * ndtri(part), 0.05], [0.15, 0.05]]])  # the first has such a part on pad 1
-    shares = je.fusion.contact_shares(position, width, amplitude, law.recon.centres, law.masks)
+    shares = je.fusion.contact_shares(position, width, amplitude, forces.recon.centres, forces.masks)
     np.testing.assert_allclose(shares.lies[0, 0, 1], part, atol=0.005)
     places, pressures = Places(position, shares.share, width, amplitude), jnp.array([[1600.0, 800.0, 0.0, 0.0]])
-    found = eqx.filter_jit(fused)(law, jnp.ones((1, 400)), pressures, places, None, 0.6)
+    found = eqx.filter_jit(fused)(forces, jnp.ones((1, 400)), pressures, places, None, 0.6)
     np.testing.assert_allclose(found.contact_force[0], shares.share[0, :, :2] @ found.force[0, :2], rtol=1e-9)
     np.testing.assert_allclose(found.contact_force.sum(), found.force.sum(), rtol=1e-9)
 
 
 def test_a_reading_across_a_wall_has_the_interval_by_which_presses_are_evaluated(located):
     """The pads share their field, so that the total errs by more than independent errors of the pads."""
-    law, (position, width) = law_of(located), (jnp.array([[[0.1, 0.05]]]), jnp.array([[0.01]]))
-    share = je.fusion.contact_shares(position, width, jnp.ones((1, 1)), law.recon.centres, law.masks).share
+    forces, (position, width) = force_model(located), (jnp.array([[[0.1, 0.05]]]), jnp.array([[0.01]]))
+    share = je.fusion.contact_shares(position, width, jnp.ones((1, 1)), forces.recon.centres, forces.masks).share
     places, pressures = Places(position, share, width, jnp.ones((1, 1))), jnp.array([[500.0, 500.0, 0.0, 0.0]])
-    law = replace(law, pads=replace(law.pads, hold_noise=None, sensor=None))
-    found = eqx.filter_jit(fused)(law, jnp.ones((1, 400)), pressures, places, None, 0.6)
-    np.testing.assert_allclose(law.pads.multiple * found.total_error, law.pads.hold_forces(pressures, places)[1])
+    forces = replace(forces, pads=replace(forces.pads, hold_noise=None, sensor=None))
+    found = eqx.filter_jit(fused)(forces, jnp.ones((1, 400)), pressures, places, None, 0.6)
+    np.testing.assert_allclose(forces.pads.multiple * found.total_error, forces.pads.hold_forces(pressures, places)[1])
     assert found.total_error[0] > np.sqrt(np.sum(found.standard_error[0] ** 2))
 
 

@@ -23,7 +23,7 @@ import jaxeit as je
 from benchmarks import bench_live
 from calib.bench import Bench, Timing, simulate
 from calib.calibration.evaluation import Evaluation
-from calib.calibration.force_maps import ForceLaw, fused
+from calib.calibration.force_maps import ForceModel, fused
 from calib.calibration.localisation.contact_tracks import PAD_SHARE, NotFollowed, prepare_calibrated_tracker
 from calib.check.placement import NOTE
 from calib.cli import main
@@ -511,14 +511,14 @@ def test_programs_for_one_frame_are_those_of_the_force_map(model, skin, pixels):
     recon, rng = je.prepare(model, basis=pixels), np.random.default_rng(0)
     pressure = np.tile(np.linspace(0, 4000, 40), (len(skin.pads), 1))
     curves = calib.fit_curves(calib.Linear(), pressure, 5e-3 * pressure[0] + rng.normal(0, 0.1, 40))
-    law = ForceLaw(recon, je.pad_masks(skin, recon), PadModel(curves), None)
+    forces = ForceModel(recon, je.pad_masks(skin, recon), PadModel(curves), None)
     frame, pressed = rng.normal(0, 1e-3, recon.readings), np.array([3000.0, 0.0, 1000.0, 0.0])
     holes, few = (np.where(rng.random(recon.readings) < share, np.nan, frame) for share in (0.3, 0.9))
-    programs = FramePrograms(law)
+    programs = FramePrograms(forces)
     programs.warm_up()
     for lacking in (frame, holes, few):
         found = programs.map(lacking, pressed, programs.nowhere, np.zeros((1, 4)))
-        other = fused(law, recon(lacking[None]), jnp.asarray(pressed[None]), None, None, 0.6)
+        other = fused(forces, recon(lacking[None]), jnp.asarray(pressed[None]), None, None, 0.6)
         np.testing.assert_allclose(found.map, other.map.force[0], rtol=1e-9, atol=1e-9 * abs(found.map).max())
         for mine, theirs in zip(found[1:4], other[1:4], strict=True):
             np.testing.assert_allclose(mine, theirs[0], rtol=1e-12)

@@ -15,7 +15,7 @@ from ...presses.windows import PressWindows
 from ...session import Session, Stream
 from ...session.units import SECOND
 from ..calibration import Calibration
-from ..force_maps import is_loaded, law_of
+from ..force_maps import force_model, is_loaded
 
 BIN = SECOND // 10  # over which pressures are averaged
 REST = 5 * BIN  # averaged before and after a contact
@@ -51,12 +51,13 @@ class UseContacts(NamedTuple):
 
 def loaded_pressures(calibration: Calibration) -> Float[np.ndarray, " pads"]:
     """Pressure (pads,) Pa from which each pad counts as loaded, as in `is_loaded`."""
-    law = law_of(calibration)
-    law = replace(law, pads=replace(law.pads, crosstalk=None))  # each pad for itself, though all rise together here
-    high = float(np.max(np.asarray(law.pads.curves.pressure_range)))
-    rising = jnp.linspace(0, high, 2000, dtype=law.pads.dtype)
+    model = force_model(calibration)
+    # each pad for itself, though all rise together here
+    model = replace(model, pads=replace(model.pads, crosstalk=None))
+    high = float(np.max(np.asarray(model.pads.curves.pressure_range)))
+    rising = jnp.linspace(0, high, 2000, dtype=model.pads.dtype)
     pads = len(calibration.skin.pads)
-    loaded = np.asarray(is_loaded(law, jnp.broadcast_to(rising[:, None], (2000, pads))))
+    loaded = np.asarray(is_loaded(model, jnp.broadcast_to(rising[:, None], (2000, pads))))
     return np.asarray(rising)[np.where(loaded.any(0), loaded.argmax(0), 1999)]
 
 

@@ -29,7 +29,7 @@ from ...session import Session, SessionError
 from ...session.given import require_session
 from ..calibration import Calibration
 from ..fitted_sessions import require_not_moved_by
-from ..force_maps import USED, ForceLaw, law_of, unmoved_forces
+from ..force_maps import USED, ForceModel, force_model, unmoved_forces
 from ..given import require_calibration
 from ..localisation.press_images import Imager
 from ..logs.calibration import LogCalibration
@@ -463,19 +463,19 @@ def gain_prior(calibration: Calibration, drift: GainDrift, *, together: bool) ->
 
 def _expected(calibration: Calibration, loads: LoadedPads, gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pad forces (n, pads) N at log gains, and the slopes (n, pads) of the total in minus the log gains."""
-    law, count = law_of(calibration).moved(None), len(loads.pressure)
+    model, count = force_model(calibration).moved(None), len(loads.pressure)
     # The last row repeats, up to one of a few lengths, because each length compiles the program again.
     rows = np.minimum(np.arange(bucket(count)), count - 1)
-    then = jnp.asarray((loads.pressure * np.exp(-gain))[rows], law.pads.dtype)
+    then = jnp.asarray((loads.pressure * np.exp(-gain))[rows], model.pads.dtype)
     places = None if loads.places is None else loads.places[jnp.asarray(rows)]
-    return tuple(np.asarray(part, float)[:count] for part in _forces_and_slopes(law, then, places))  # type: ignore[return-value]
+    return tuple(np.asarray(part, float)[:count] for part in _forces_and_slopes(model, then, places))  # type: ignore[return-value]
 
 
 @je.verb
 def _forces_and_slopes(
-    law: ForceLaw, pressures: Float[Array, "n pads"], places: Places | None
+    model: ForceModel, pressures: Float[Array, "n pads"], places: Places | None
 ) -> tuple[Float[Array, "n pads"], Float[Array, "n pads"]]:
-    response: Callable[[Array], Array] = lambda p: unmoved_forces(law, p, places)  # noqa: E731
+    response: Callable[[Array], Array] = lambda p: unmoved_forces(model, p, places)  # noqa: E731
     return response(pressures), gain_slopes(response, pressures).sum(-1).T
 
 
