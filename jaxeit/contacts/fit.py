@@ -11,7 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from ..least_squares import DampingSearch, ImplicitStep, LeastSquaresState, LevenbergMarquardt, normal_equations
-from ..least_squares.searches import Quadratic, normal_inverse
+from ..least_squares.searches import HalfSquares, normal_inverse
 from .bump_responses import Responses
 
 # Largest half length of an oblong contact, m.
@@ -81,7 +81,7 @@ def bumps_along(flat: Float[Array, "6"]) -> Float[Array, "4 4"]:
     return jnp.concatenate([centre, rest], 1)
 
 
-class Bumps(eqx.Module):
+class FrameResponse(eqx.Module):
     """How the numbers that a frame holds depend on contacts, and within which bounds contacts are looked for.
 
     | meaning                                                                          | shape      |
@@ -195,7 +195,7 @@ class Bumps(eqx.Module):
 class _FrameProblem(NamedTuple):
     """The numbers (r,) of a frame, and contacts of some shape that are to explain them."""
 
-    bumps: Bumps
+    bumps: FrameResponse
     y: Float[Array, " r"]
     shape: Shape
 
@@ -204,7 +204,7 @@ def _residual(flat: Float[Array, " m"], problem: _FrameProblem) -> Float[Array, 
     return problem.y - problem.bumps.response(problem.shape(flat))[0]
 
 
-def _quadratic(flat: Float[Array, " m"], problem: _FrameProblem) -> Quadratic:
+def _quadratic(flat: Float[Array, " m"], problem: _FrameProblem) -> HalfSquares:
     """The response knows its slopes."""
     theta = problem.shape(flat)
     value, slopes = problem.bumps.response(theta)

@@ -21,7 +21,7 @@ from .._compile import by_platform, sequential_on_cpu, usually, verb
 from ..imaging.missing import gap_of, lost_of_frame
 from ..imaging.noise import Whitening, require_frames
 from .bump_responses import Responses
-from .fit import Bumps, ContactFit, UnfinishedFit, one_row_each
+from .fit import ContactFit, FrameResponse, UnfinishedFit, one_row_each
 from .result import ContactResult, Contacts
 from .starts import Atoms, lengths_of, split
 
@@ -82,7 +82,7 @@ class ContactFinder(eqx.Module):
     | model_error: part of the signal that a bump may fail to explain           | ()           | 1     |
     | ratio: part of what a fit leaves that it must explain more than a simpler one | ()        | 1     |
     | separation: least distance of two contacts, in mean widths                | ()           | 1     |
-    | root, whole: of a frame without missing readings, see `Bumps`             | (r, r), ()   | 1     |
+    | root, whole: of a frame without missing readings, see `FrameResponse`     | (r, r), ()   | 1     |
     | most: contacts looked for, K                                              |              |       |
 
     Example:
@@ -128,14 +128,14 @@ class ContactFinder(eqx.Module):
         """Number of readings of a frame."""
         return self.whitening.channels.shape[0]
 
-    def bumps(self, root: Float[Array, "r r"], whole: Bool[Array, ""]) -> Bumps:
+    def bumps(self, root: Float[Array, "r r"], whole: Bool[Array, ""]) -> FrameResponse:
         """How the numbers that a frame holds depend on contacts.
 
         Args:
             root, whole: of the frame, as `compressed` gives them: what mixes the responses where readings are missing,
                 and whether none is.
         """
-        return Bumps(self.responses, self.low, self.high, root, whole)
+        return FrameResponse(self.responses, self.low, self.high, root, whole)
 
     def atom_table(self, root: Float[Array, "r r"], whole: Bool[Array, ""]) -> Atoms:
         """Bumps from which contacts are started, as a frame shows them; ``root`` and ``whole`` as for `bumps`."""
@@ -148,7 +148,7 @@ class ContactFinder(eqx.Module):
         seen, whole = self.compressed(dv)
         bumps = self.bumps(seen.root, whole)
         search = _Search(self, bumps, self.atom_table(seen.root, whole), seen.y)
-        found = jax.lax.stop_gradient(search).contacts()  # derivatives: see `Bumps.sensitive`
+        found = jax.lax.stop_gradient(search).contacts()  # derivatives: see `FrameResponse.sensitive`
         return self._contacts(bumps, seen, found, jnp.any(there))
 
     def compressed(self, dv: Float[Array, " readings"]) -> tuple[Frame, Bool[Array, ""]]:
@@ -169,7 +169,7 @@ class ContactFinder(eqx.Module):
         seen, every = (gap_of(matrix, lost) for matrix in (self.compress, jnp.concatenate([self.compress, self.rest])))
         return Frame(seen.y, jnp.maximum(every.y @ every.y - seen.y @ seen.y, 0), every.rank, seen.root)
 
-    def _contacts(self, bumps: Bumps, seen: Frame, found: Found, readable: Bool[Array, ""]) -> Contacts:
+    def _contacts(self, bumps: FrameResponse, seen: Frame, found: Found, readable: Bool[Array, ""]) -> Contacts:
         """What was found as it is handed out, the strongest first."""
         present = jnp.arange(self.most) < found.number
         theta, covariance = bumps.sensitive(seen.y, one_row_each(found.fit.flat), present)
@@ -209,7 +209,7 @@ class _Search(eqx.Module):
     """The search of one frame, whose numbers are y: see `prepare_contacts` for when it stops."""
 
     finder: ContactFinder
-    bumps: Bumps
+    bumps: FrameResponse
     atoms: Atoms
     y: Float[Array, " r"]
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .fit import Bumps
+from .fit import FrameResponse
 
 # Part of an atom's square that the other atom of a pair must leave unexplained. Two atoms more alike than that are one
 # place twice, and their strengths would be differences of large numbers.
@@ -43,11 +43,11 @@ class Atoms(eqx.Module):
     alike: Float[Array, "b b"]
     lengths: Float[Array, " b"]
 
-    def gain(self, bumps: Bumps, y: Float[Array, " r"]) -> Float[Array, " b"]:
+    def gain(self, bumps: FrameResponse, y: Float[Array, " r"]) -> Float[Array, " b"]:
         """Root of the square of y that each atom explains alone; negative where its strength would be."""
         return self.atoms @ bumps.mixed(y) / self.lengths
 
-    def likeness(self, bumps: Bumps, few: Int[Array, "..."]) -> Float[Array, "... b"]:
+    def likeness(self, bumps: FrameResponse, few: Int[Array, "..."]) -> Float[Array, "... b"]:
         """Products of a few atoms, by number, with all, each of length one as the frame shows it."""
 
         def mixed() -> Float[Array, "... b"]:
@@ -57,12 +57,12 @@ class Atoms(eqx.Module):
         found: Array = jax.lax.cond(bumps.whole, lambda: self.alike[few], mixed)
         return found
 
-    def one_more(self, bumps: Bumps, y: Float[Array, " r"], theta: Float[Array, "n 4"]) -> Float[Array, "m 4"]:
+    def one_more(self, bumps: FrameResponse, y: Float[Array, " r"], theta: Float[Array, "n 4"]) -> Float[Array, "m 4"]:
         """One contact more: the atom that explains most of what is left."""
         gain = self.gain(bumps, y - bumps.response(theta)[0] if len(theta) else y)
         return jnp.concatenate([theta, self._contact(gain, jnp.argmax(gain))[None]])
 
-    def other(self, bumps: Bumps, y: Float[Array, " r"]) -> Float[Array, "1 4"]:
+    def other(self, bumps: FrameResponse, y: Float[Array, " r"]) -> Float[Array, "1 4"]:
         """Another start of a single contact: the atom that explains most of those unlike the best one.
 
         Beside an electrode the narrowest contact is a minimum of its own, to which the best atom may lead.
@@ -75,7 +75,7 @@ class Atoms(eqx.Module):
         strength = jnp.maximum(gain[atom], 0) / (self.norms[atom] * self.lengths[atom])
         return jnp.append(self.starts[atom], strength)
 
-    def pair(self, bumps: Bumps, y: Float[Array, " r"]) -> Float[Array, "2 4"]:
+    def pair(self, bumps: FrameResponse, y: Float[Array, " r"]) -> Float[Array, "2 4"]:
         """Two contacts: the atoms that explain most together.
 
         Two contacts of one strength may look most like a single one between them, from which neither is found.
@@ -101,7 +101,7 @@ class Atoms(eqx.Module):
 def lengths_of(
     atoms: Float[Array, "b r"], norms: Float[Array, " b"], root: Float[Array, "r r"], whole: Bool[Array, ""]
 ) -> Float[Array, " b"]:
-    """`Atoms.lengths` of a frame; ``root`` and ``whole`` as in `Bumps`."""
+    """`Atoms.lengths` of a frame; ``root`` and ``whole`` as in `FrameResponse`."""
 
     def mixed() -> Float[Array, " b"]:
         lengths = jnp.sqrt(jnp.sum((atoms @ root.T) ** 2, 1))
@@ -112,7 +112,7 @@ def lengths_of(
     return found
 
 
-def split(bumps: Bumps, y: Float[Array, " r"], theta: Float[Array, "n 4"]) -> Float[Array, "m 4"]:
+def split(bumps: FrameResponse, y: Float[Array, " r"], theta: Float[Array, "n 4"]) -> Float[Array, "m 4"]:
     """One contact more: the strongest contact in two halves, along the best of a few directions."""
     first = jnp.argmax(theta[:, 3])
     angle = jnp.arange(SPLIT_DIRECTIONS, dtype=y.dtype) * (jnp.pi / SPLIT_DIRECTIONS)

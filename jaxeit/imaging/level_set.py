@@ -16,7 +16,7 @@ from scipy.ndimage import distance_transform_edt
 
 from .._compile import verb
 from ..least_squares import quadratic
-from ..least_squares.searches import Quadratic as HalfSquares
+from ..least_squares.searches import HalfSquares
 from ..model.bases import Picture
 from .absolute.background import require_positive
 from .absolute.images import AbstractPosterior, ImagePosterior, Quadratic, most_probable

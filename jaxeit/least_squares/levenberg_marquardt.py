@@ -14,7 +14,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from ..spelling import did_you_mean
-from .searches import BoundedDescent, DampingSearch, Parameters, Quadratic, Scalar, normal_equations
+from .searches import BoundedDescent, DampingSearch, HalfSquares, Parameters, Scalar, normal_equations
 
 OPTIONS = frozenset({"lower", "upper", "curvature", "quadratic", "aim", "outlook", "state"})
 """Names of the options of `LevenbergMarquardt`."""
@@ -35,7 +35,7 @@ class LeastSquaresState(eqx.Module):
     """
 
     trial: Parameters
-    quadratic: Quadratic
+    quadratic: HalfSquares
     search: Any
     promised: Scalar
     steps: Int[Array, ""]
@@ -48,7 +48,9 @@ class LeastSquaresState(eqx.Module):
         return 2 * (self.quadratic.f - jnp.where(self.converged, self.promised, 0))
 
 
-def quadratic_at(fn: Callable[..., Any], y: Parameters, args: Any, options: Mapping[str, Any]) -> tuple[Quadratic, Any]:
+def quadratic_at(
+    fn: Callable[..., Any], y: Parameters, args: Any, options: Mapping[str, Any]
+) -> tuple[HalfSquares, Any]:
     """The quadratic of half the sum of squares of ``fn`` at y, as `LevenbergMarquardt` takes it, and what else ``fn``
     returns."""
     if "quadratic" in options:
@@ -137,7 +139,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Parameters, Any, Any, L
         after = LeastSquaresState(y + step, known, search, promised, steps, converged, hopeless)
         return jnp.where(converged, after.trial, y), after, aux
 
-    def _step(self, y: Parameters, quadratic: Quadratic, size: Scalar, options: dict[str, Any]) -> Parameters:
+    def _step(self, y: Parameters, quadratic: HalfSquares, size: Scalar, options: dict[str, Any]) -> Parameters:
         descent = self.descent
         if "lower" in options or "upper" in options:
             if not isinstance(descent, BoundedDescent):

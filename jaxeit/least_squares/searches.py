@@ -21,7 +21,7 @@ Scalar = Float[Array, ""]
 
 if TYPE_CHECKING:  # for type checkers optimistix keeps the class among the variables of another
 
-    class Quadratic(optx.FunctionInfo):
+    class HalfSquares(optx.FunctionInfo):
         """Half a sum of squares near a point: value, gradient and second derivative."""
 
         f: Scalar
@@ -32,7 +32,7 @@ if TYPE_CHECKING:  # for type checkers optimistix keeps the class among the vari
 
         def as_min(self) -> Scalar: ...
 else:
-    Quadratic = optx.FunctionInfo.EvalGradHessian
+    HalfSquares = optx.FunctionInfo.EvalGradHessian
 
 # For type checkers its class holds the text of each result.
 SUCCESSFUL = cast(optx.RESULTS, optx.RESULTS.successful)
@@ -43,18 +43,18 @@ RIDGE = 1e3
 MIN_CURVATURE = 0.01
 
 
-def quadratic(value: Scalar, gradient: Parameters, hessian: Matrix) -> Quadratic:
+def quadratic(value: Scalar, gradient: Parameters, hessian: Matrix) -> HalfSquares:
     """An objective near a point, ``value + gradient . d + d^T hessian d / 2``.
 
     Example:
         bowl = ls.quadratic(jnp.array(0.0), jnp.ones(2), 2 * jnp.eye(2))  # d . (1, 1) + |d|^2
     """
-    return Quadratic(value, gradient, lx.MatrixLinearOperator(hessian, lx.positive_semidefinite_tag))
+    return HalfSquares(value, gradient, lx.MatrixLinearOperator(hessian, lx.positive_semidefinite_tag))
 
 
 def normal_equations(
     residual: Float[Array, " n"], slopes: Float[Array, "n k"], weight: Float[Array, " n"] | None = None
-) -> Quadratic:
+) -> HalfSquares:
     """Half the sum of squares of residuals near a point, from their slopes J: J^T r, and J^T diag(weight) J.
 
     Args:
@@ -124,10 +124,10 @@ class _AtPoint(NamedTuple):
     """The point from which a step is made, and the quadratic there."""
 
     y: Parameters
-    quadratic: Quadratic
+    quadratic: HalfSquares
 
 
-class BoundedDescent(optx.AbstractDescent[Parameters, Quadratic, _AtPoint]):
+class BoundedDescent(optx.AbstractDescent[Parameters, HalfSquares, _AtPoint]):
     """Marquardt's damped step inside a box; the damping is one over the step size, as in optimistix.
 
     A parameter that is pushed against its bound rests there. One that the step would take out of the box goes to its
@@ -144,11 +144,11 @@ class BoundedDescent(optx.AbstractDescent[Parameters, Quadratic, _AtPoint]):
         """The same descent inside another box."""
         return BoundedDescent(lower, upper)
 
-    def init(self, y: Parameters, f_info_struct: Quadratic) -> _AtPoint:
+    def init(self, y: Parameters, f_info_struct: HalfSquares) -> _AtPoint:
         """Nothing is known yet."""
         return _AtPoint(y, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), f_info_struct))
 
-    def query(self, y: Parameters, f_info: Quadratic, state: _AtPoint) -> _AtPoint:
+    def query(self, y: Parameters, f_info: HalfSquares, state: _AtPoint) -> _AtPoint:
         """Remember the point."""
         return _AtPoint(y, f_info)
 
@@ -173,7 +173,7 @@ class BoundedDescent(optx.AbstractDescent[Parameters, Quadratic, _AtPoint]):
         return jax.lax.cond(jnp.any(below | above), others_anew, lambda: step), SUCCESSFUL
 
 
-class DampingSearch(optx.AbstractSearch[Parameters, Quadratic, Quadratic, Scalar]):
+class DampingSearch(optx.AbstractSearch[Parameters, HalfSquares, HalfSquares, Scalar]):
     """Takes every step that leads down; less damping after it, more after one that leads up.
 
     | meaning                                                    | default |
@@ -189,7 +189,7 @@ class DampingSearch(optx.AbstractSearch[Parameters, Quadratic, Quadratic, Scalar
     after_ascent: float = 10.0
     least: float = 1e-9
 
-    def init(self, y: Parameters, f_info_struct: Quadratic) -> Scalar:
+    def init(self, y: Parameters, f_info_struct: HalfSquares) -> Scalar:
         """The first damping."""
         return jnp.full((), self.first, y.dtype)
 
@@ -198,8 +198,8 @@ class DampingSearch(optx.AbstractSearch[Parameters, Quadratic, Quadratic, Scalar
         first_step: Bool[Array, ""],
         y: Parameters,
         y_eval: Parameters,
-        f_info: Quadratic,
-        f_eval_info: Quadratic,
+        f_info: HalfSquares,
+        f_eval_info: HalfSquares,
         state: Scalar,
     ) -> tuple[Scalar, Bool[Array, ""], optx.RESULTS, Scalar]:
         """Step size (one over the damping), whether the last step is taken, and the damping."""

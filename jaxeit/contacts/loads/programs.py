@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..._compile import verb
 from ...least_squares import ImplicitStep, normal_equations
-from ...least_squares.searches import Quadratic
+from ...least_squares.searches import HalfSquares
 from ...linalg import lapack
 from ..fit import SOLVER
 from .pressure import MOST, SIZE, Form, Forms, Parameters
@@ -77,7 +77,7 @@ def _residual(flat: Float[Array, " m"], problem: Problem) -> Float[Array, " n"]:
     return jnp.append(lapack.solve_triangular(problem.root, left, lower=True), unusual(flat, problem))
 
 
-def _quadratic(flat: Float[Array, " m"], problem: Problem) -> Quadratic:
+def _quadratic(flat: Float[Array, " m"], problem: Problem) -> HalfSquares:
     """The sum of squares near some loads; the sheet knows its slopes."""
     sheet, loads = problem.fitter.sheet, flat.reshape(MOST, SIZE)
     at = sheet.linearised(loads, problem.forms)

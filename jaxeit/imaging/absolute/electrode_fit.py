@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int
 
 from ..._compile import require_known, verb
 from ...least_squares import LeastSquaresState, normal_equations, quadratic
-from ...least_squares.searches import Quadratic as HalfSquares, normal_inverse
+from ...least_squares.searches import HalfSquares, normal_inverse
 from ...model.bases import BasisMap, Pixels
 from ...model.discretisation import Model
 from ...model.forward_model import coefficients, fields, forward, terminal_matrix, voltages

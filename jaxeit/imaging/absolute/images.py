@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from ..._compile import full_precision, verb
 from ...least_squares import Cholesky, ImplicitStep, LeastSquaresState, LevenbergMarquardt, normal_equations, quadratic
-from ...least_squares.searches import Quadratic as HalfSquares
+from ...least_squares.searches import HalfSquares
 from ...model.bases import BasisMap, Picture
 from ...model.discretisation import Model
 from ...model.forward_model import forward
