@@ -29,7 +29,7 @@ SPREAD, SCATTER, SHAPE = np.array([1.0, 1.0, 2.0]), 0.3, 1.5
 FEWEST, SURE = 5, 3.0
 # How far beyond the logs of force and width from which it was learned the law holds; its largest log factor; and the
 # least slope 1 + b, below which readings hardly tell a force.
-BEYOND, MOST, LEAST_SLOPE = 0.5, 3.0, 0.3
+BEYOND, MAX_LOG_FACTOR, LEAST_SLOPE = 0.5, 3.0, 0.3
 USUAL = np.log([LoadSettings.force, LoadSettings.width])
 
 
@@ -161,7 +161,7 @@ class ContactLaw(NamedTuple):
         factor = -(self.mean[0] + (self.slope - 1) * within + self.mean[2] * width)
         x = np.array([1.0, within, width])
         error = self.scatter * math.sqrt(1 + float(x @ self.covariance @ x)) / self.slope
-        force = track.force * math.exp(float(np.clip(factor, -MOST, MOST)))
+        force = track.force * math.exp(float(np.clip(factor, -MAX_LOG_FACTOR, MAX_LOG_FACTOR)))
         return track._replace(force=force, log_force_error=error)
 
     def without_pads(self, tracks: tuple[Track, ...], told: Bool[np.ndarray, " n"]) -> tuple[Track, ...]:

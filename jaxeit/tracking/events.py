@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .belief.filter import PLACE, ROUND, SIZE, Belief
+from .belief.filter import CONTACT_SIZE, PLACE_STD, ROUND_HALF, Belief, numbers_of
 from .settings import TrackerSettings
 
 # Half length of an edge that is tried, m.
@@ -71,7 +71,7 @@ class Events:
 
         The prior of a place is even over the skin, that of the fit is normal about where it begins.
         """
-        return self.rare(seconds) + float(np.log(2 * np.pi * PLACE**2 / self._area))
+        return self.rare(seconds) + float(np.log(2 * np.pi * PLACE_STD**2 / self._area))
 
     def possible(
         self,
@@ -115,12 +115,12 @@ class Events:
     def _beginning(self, place: Float[np.ndarray, "2"]) -> tuple[np.ndarray, np.ndarray]:
         """The numbers of a contact that begins about a place, m, and their standard deviations."""
         row = np.array([*place, *self._usual, 0.0, 0.0, 0.0, 0.0])
-        return row, np.array([PLACE, PLACE, *self._spread, ROUND, ROUND, VELOCITY, VELOCITY])
+        return row, np.array([PLACE_STD, PLACE_STD, *self._spread, ROUND_HALF, ROUND_HALF, VELOCITY, VELOCITY])
 
 
 def without(belief: Belief, k: int) -> Belief:
     """Without contact k."""
-    kept = np.delete(np.arange(len(belief.covariance)), np.s_[SIZE * k : SIZE * (k + 1)])
+    kept = np.delete(np.arange(len(belief.covariance)), numbers_of(k))
     contacts = np.delete(np.asarray(belief.contacts), k, 0)
     covariance = np.asarray(belief.covariance)[np.ix_(kept, kept)]
     return belief._replace(contacts=jnp.asarray(contacts), covariance=jnp.asarray(covariance))
@@ -130,20 +130,20 @@ def inserted(belief: Belief, row: np.ndarray, spread: np.ndarray) -> Belief:
     """With a contact after the others that is independent of all else."""
     place = belief.contacts.size
     old = np.asarray(belief.covariance)
-    kept = np.concatenate([np.arange(place), np.arange(place + SIZE, len(old) + SIZE)])
-    covariance = np.zeros((len(old) + SIZE,) * 2, old.dtype)
+    kept = np.concatenate([np.arange(place), np.arange(place + CONTACT_SIZE, len(old) + CONTACT_SIZE)])
+    covariance = np.zeros((len(old) + CONTACT_SIZE,) * 2, old.dtype)
     covariance[np.ix_(kept, kept)] = old
-    covariance[place : place + SIZE, place : place + SIZE] = np.diag(spread**2)
+    covariance[place : place + CONTACT_SIZE, place : place + CONTACT_SIZE] = np.diag(spread**2)
     contacts = np.concatenate([np.asarray(belief.contacts), row[None]]).astype(old.dtype)
     return belief._replace(contacts=jnp.asarray(contacts), covariance=jnp.asarray(covariance))
 
 
 def replaced(belief: Belief, k: int, row: np.ndarray, spread: np.ndarray) -> Belief:
     """With another contact in the place of contact k, that is independent of all else."""
-    contacts, covariance, own = np.array(belief.contacts), np.array(belief.covariance), SIZE * k + np.arange(SIZE)
+    contacts, covariance, own = np.array(belief.contacts), np.array(belief.covariance), numbers_of(k)
     contacts[k] = row
     covariance[own] = covariance[:, own] = 0
-    covariance[own, own] = spread**2
+    covariance[own, own] = np.diag(spread**2)
     return belief._replace(contacts=jnp.asarray(contacts), covariance=jnp.asarray(covariance))
 
 
@@ -157,7 +157,7 @@ def jumped(belief: Belief) -> Belief:
 def lengthened(belief: Belief, k: int, angle: float) -> Belief:
     """With contact k as an edge in about this direction."""
     contacts, covariance = np.array(belief.contacts), np.array(belief.covariance)
-    own = np.arange(SIZE * k, SIZE * (k + 1))
+    own = np.arange(len(covariance))[numbers_of(k)]
     contacts[k, 4:6] = HALF * np.cos(angle), HALF * np.sin(angle)
     contacts[k, 2] -= NARROWER
     covariance[own, own] += EDGE**2
@@ -172,6 +172,6 @@ def joined(belief: Belief, first: int, second: int) -> Belief:
     contacts[first, :3] = force @ pair[:, :3] / force.sum()
     contacts[first, 3], contacts[first, 4:6] = np.log(force.sum()), BETWEEN * (pair[1, :2] - pair[0, :2])
     contacts[first, 6:] = pair[:, 6:].mean(0)
-    own = np.arange(SIZE * first, SIZE * (first + 1))
+    own = np.arange(len(covariance))[numbers_of(first)]
     covariance[own, own] += EDGE**2
     return without(belief._replace(contacts=jnp.asarray(contacts), covariance=jnp.asarray(covariance)), second)

@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .belief.filter import SIZE, Update
+from .belief.filter import CONTACT_SIZE, Update
 from .belief.programs import Programs
 from .events import Events, Hypothesis
 from .tracks import MOST_PATIENCE, PATIENCE, Backlog, Look, Seen, Tracking, Trial
@@ -54,7 +54,7 @@ def is_doubted(now: Tracking) -> bool:
 
 def _doubted(now: Tracking) -> list[int]:
     """Which contacts may be none."""
-    forces = SIZE * np.arange(len(now.numbers)) + 3
+    forces = CONTACT_SIZE * np.arange(len(now.numbers)) + 3
     errors = np.sqrt(np.diag(np.asarray(now.belief.covariance))[forces])
     return [k for k, error in enumerate(errors) if error > DOUBTED and not now.edges[k]]
 

@@ -26,7 +26,7 @@ from ..model.scene import Scene
 from ..model.sensitivity import pair_jacobian
 from ..skin.description import Skin
 from .belief.apparent_gain import apparent_gain
-from .belief.filter import PLACE, SIZE, ContactFilter
+from .belief.filter import CONTACT_SIZE, PLACE_STD, ContactFilter
 from .belief.layer import GainField
 from .belief.reanalysis import prepare_reanalysis
 from .belief.response import LoadedSheet, Neighbours, half_lengths
@@ -83,7 +83,7 @@ def prepare_filter(
         gain_rate=put(settings.gain_rate / settings.level),
         tail=put(settings.tail),
         shape=put(loads.shape),
-        spread=put([PLACE, PLACE, loads.width_spread, loads.force_spread]),
+        spread=put([PLACE_STD, PLACE_STD, loads.width_spread, loads.force_spread]),
         active_modes=settings.modes,
     )
     doubted = sheet if untouched is None else with_errors(sheet, model, untouched.errors)
@@ -266,5 +266,5 @@ def _carried(
 def _rates(settings: TrackerSettings) -> list[float]:
     """Random walk of each number of a contact, per root of a second; a place moves by its velocity alone."""
     rates = [1e-4, 1e-4, settings.width_rate, settings.force_rate, 1e-4, 1e-4, *2 * [settings.acceleration]]
-    assert len(rates) == SIZE
+    assert len(rates) == CONTACT_SIZE
     return rates

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .belief.consider import ConsiderErrors
-from .belief.filter import SIZE, Belief, predicted
+from .belief.filter import CONTACT_SIZE, Belief, numbers_of, predicted
 from .tracker import Tracker
 from .tracks import Track, Tracking, track_of
 
@@ -50,10 +50,11 @@ class State(NamedTuple):
 
 def transition(tracker: Tracker, seconds: float) -> Transition:
     """How the filter predicts a contact so many seconds later."""
-    unit, none = jnp.eye(SIZE, dtype=tracker.filter.places.dtype), partial(jnp.zeros, dtype=tracker.filter.places.dtype)
-    numbers = Belief(unit, none(1), none((SIZE**2 + 1,) * 2), level=none(2).at[1].set(1))
+    dtype = tracker.filter.places.dtype
+    unit, none = jnp.eye(CONTACT_SIZE, dtype=dtype), partial(jnp.zeros, dtype=dtype)
+    numbers = Belief(unit, none(1), none((CONTACT_SIZE**2 + 1,) * 2), level=none(2).at[1].set(1))
     found = predicted(tracker.filter, numbers, jnp.asarray(seconds))
-    return Transition(np.asarray(found.contacts).T, np.asarray(found.covariance)[:SIZE, :SIZE])
+    return Transition(np.asarray(found.contacts).T, np.asarray(found.covariance)[:CONTACT_SIZE, :CONTACT_SIZE])
 
 
 def smoothed(states: Sequence[State], steps: Sequence[Transition]) -> list[State]:
@@ -80,7 +81,7 @@ def _one_back(state: State, step: Transition, after: State, told: State) -> Stat
     if np.linalg.eigvalsh(0.5 * (white + white.T))[-1] > JUMPED:
         return state
     gain = np.linalg.solve(ahead / np.outer(scale, scale), (matrix @ state.covariance) / scale[:, None]).T / scale
-    kept = np.eye(SIZE) - gain @ matrix
+    kept = np.eye(CONTACT_SIZE) - gain @ matrix
     covariance = kept @ state.covariance @ kept.T + gain @ (walk + told.covariance) @ gain.T
     return State(state.mean + gain @ (told.mean - matrix @ state.mean), 0.5 * (covariance + covariance.T))
 
@@ -136,8 +137,7 @@ class Smoother:
         settled."""
         contacts, covariance = np.asarray(now.belief.contacts), np.asarray(now.belief.covariance)
         states = {
-            number: State(contacts[k], covariance[SIZE * k : SIZE * (k + 1), SIZE * k : SIZE * (k + 1)])
-            for k, number in enumerate(now.numbers)
+            number: State(contacts[k], covariance[numbers_of(k), numbers_of(k)]) for k, number in enumerate(now.numbers)
         }
         edges = dict(zip(now.numbers, now.edges, strict=True))
         self._frames.append(_Frame(time, states, edges, now.considered, seconds))

@@ -18,7 +18,7 @@ from ..imaging.noise import InverseError
 from ..model.discretisation import Model, require_model
 from ..skin.description import Skin
 from .belief.consider import ConsiderErrors
-from .belief.filter import SEEN, SIZE, TOLD, Belief, ContactFilter, Pads, Update
+from .belief.filter import CONTACT_SIZE, MIN_TOLD_SHARE, SEEN_SIZE, Belief, ContactFilter, Pads, Update
 from .belief.layer import GainField, LearnedLayer
 from .belief.programs import Programs
 from .events import Events
@@ -99,7 +99,7 @@ class Tracker:
         """The belief without contacts; its gain is that under the next press."""
         put, covariance = partial(jnp.asarray, dtype=self.filter.places.dtype), layer.before_press
         level = np.array([layer.mean[0], covariance[0, 0]])
-        return Belief(put(np.zeros((0, SIZE))), put(layer.mean), put(covariance), put(level))
+        return Belief(put(np.zeros((0, CONTACT_SIZE))), put(layer.mean), put(covariance), put(level))
 
     def learned(self, now: Tracking) -> LearnedLayer:
         """What contacts have told of the gain of the contact layer up to now, to `start` with another time."""
@@ -118,10 +118,10 @@ class Tracker:
     def told_by_pads(
         self, tracks: tuple[Track, ...], pad_errors: Float[ArrayLike, " pads"] | None = None
     ) -> Bool[np.ndarray, " n"]:
-        """Of which contacts pads tell the force, (n,): at least `TOLD` of the load lies on pads whose force is known.
+        """Of which contacts pads tell the force, (n,): pads whose force is known bear `MIN_TOLD_SHARE` of it or more.
 
-        The same rule is part of each step of the filter (`telling_pads`); here
-        it is computed in NumPy, as tracks are any number and JAX would compile a program for each.
+        The same rule is part of each step of the filter (`telling_pads`); here it is computed in NumPy, as tracks are
+        any number and JAX would compile a program for each.
 
         Args:
             pad_errors: as for `step`; not finite for a pad that tells no force.
@@ -135,7 +135,7 @@ class Tracker:
         width = np.maximum(width, np.sqrt(self.area / len(pixels)))  # narrower loads would fall between pixels
         square = ((rows[:, :, None] - pixels) ** 2).sum(-1)
         load = np.exp(-0.5 * square / width[..., None] ** 2).mean(1) / (2 * np.pi * width**2)
-        return np.asarray(load @ area >= TOLD)
+        return np.asarray(load @ area >= MIN_TOLD_SHARE)
 
     def step(
         self,
@@ -252,7 +252,7 @@ class Tracker:
         if not now.numbers or now.considered.holds(now.numbers, contacts):
             return now
         covariance = self.programs.consider_covariance(now.belief, pads, now.layer.unexplained)
-        return replace(now, considered=ConsiderErrors(now.numbers, contacts[:, :SEEN], covariance))
+        return replace(now, considered=ConsiderErrors(now.numbers, contacts[:, :SEEN_SIZE], covariance))
 
     def _looked(self, now: Tracking, backlog: Backlog) -> Tracking:
         before, look, waiting = backlog.before, backlog.look, backlog.waiting

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .belief.consider import ConsiderErrors
-from .belief.filter import SIZE, Attempt, Belief, Pads
+from .belief.filter import Attempt, Belief, Pads, numbers_of
 from .belief.layer import LearnedLayer
 from .events import Hypothesis
 
@@ -77,7 +77,7 @@ class Tracking:
     def tracks(self) -> tuple[Track, ...]:
         """The contacts, in the order in which they began."""
         contacts, covariance = np.asarray(self.belief.contacts), np.asarray(self.belief.covariance)
-        blocks = [covariance[own, own] for own in (slice(SIZE * k, SIZE * (k + 1)) for k in range(len(contacts)))]
+        blocks = [covariance[own, own] for own in map(numbers_of, range(len(contacts)))]
         return tuple(
             track_of(number, contacts[k], self.considered.added(number, blocks[k]), edge)
             for k, (number, edge) in enumerate(zip(self.numbers, self.edges, strict=True))

@@ -21,7 +21,7 @@ from calib.calibration.localisation.contact_tracks import (
     NotFollowed,
     pad_errors,
 )
-from calib.calibration.localisation.load_windows import ABOUT as LOAD_ARRAYS, LEARNED, MOST
+from calib.calibration.localisation.load_windows import ABOUT as LOAD_ARRAYS, LEARNED, MAX_LOADS
 from calib.calibration.localisation.quiet_frames import QuietFrames
 from calib.cli import main
 from calib.report.track_report import by_number, write_track_report
@@ -178,7 +178,7 @@ def test_a_report_tells_what_touched_the_skin(tmp_path, skin):
     """Each window with the probabilities of its kinds, and the loads of the most probable one."""
     pytest.importorskip("matplotlib")
     probability = np.array([[0.0, 0.91, 0.05, 0.04, 0.0], [0.0, 0.02, 0.17, 0.81, 0.0]])
-    nothing = np.full((2, MOST, 2), np.nan)
+    nothing = np.full((2, MAX_LOADS, 2), np.nan)
     nothing[:, 0] = [[0.03, 0.04], [0.123, 0.056]]
     force = np.array([[5.0, np.nan, np.nan], [7.25, np.nan, np.nan]])
     windows = {

@@ -11,7 +11,7 @@ import calib
 import jaxeit as je
 from calib.bench import load_bench, simulate
 from calib.calibration.localisation import load_windows
-from calib.calibration.localisation.learned_loads import FEWEST, MOST, learned_loads, render_loads
+from calib.calibration.localisation.learned_loads import MAX_PRESSES, MIN_PRESSES, learned_loads, render_loads
 from calib.calibration.localisation.load_windows import WindowedFrames
 from calib.calibration.localisation.proposals import chosen_proposal
 from calib.calibration.press_examples import PressExamples
@@ -98,7 +98,7 @@ def presses(count, readings, pads):
 
 def test_whole_presses_of_a_calibration_tell_loads(calibration, model, monkeypatch):
     readings, given = calibration.recon.readings, []
-    probes = presses(MOST + 4, readings, 4)
+    probes = presses(MAX_PRESSES + 4, readings, 4)
     channels = np.arange(readings) != 5
     probes.dv[0, 5] = np.nan  # of a reading that is not used
     probes.dv[2, 7] = np.nan
@@ -113,15 +113,15 @@ def test_whole_presses_of_a_calibration_tell_loads(calibration, model, monkeypat
     found, line = learned_loads(replace(calibration, probes=probes), model, known)
     assert found.texture == 0.1
     assert line == render_loads(found)
-    (dv, position, force, gain), whole = given[0], [0, 1, *range(3, MOST + 1)]
+    (dv, position, force, gain), whole = given[0], [0, 1, *range(3, MAX_PRESSES + 1)]
     np.testing.assert_array_equal(position, probes.position[whole])
     np.testing.assert_array_equal(force, probes.force[whole])
-    assert dv.shape == (MOST, readings)
+    assert dv.shape == (MAX_PRESSES, readings)
     assert gain is calibration.layer
-    few = replace(calibration, probes=presses(FEWEST - 1, readings, 4))
+    few = replace(calibration, probes=presses(MIN_PRESSES - 1, readings, 4))
     found, line = learned_loads(few, model, known)
     assert found is None
-    assert f"as {FEWEST - 1} presses of the calibration lack no reading, and {FEWEST} are needed" in line
+    assert f"as {MIN_PRESSES - 1} presses of the calibration lack no reading, and {MIN_PRESSES} are needed" in line
     found, line = learned_loads(replace(calibration, probes=None), model, known)
     assert found is None
     assert "kept no presses" in line
@@ -134,7 +134,7 @@ def test_presses_whose_fits_do_not_converge_tell_nothing(calibration, model, mon
 
     monkeypatch.setattr(je.contacts, "learn_loads", learn)
     readings = calibration.recon.readings
-    probes = replace(calibration, probes=presses(FEWEST, readings, 4))
+    probes = replace(calibration, probes=presses(MIN_PRESSES, readings, 4))
     found, line = learned_loads(probes, model, {"channels": np.ones(readings, bool)})
     assert found is None
     assert line == "nothing by the presses of the calibration: no fit converges"

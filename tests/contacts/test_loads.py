@@ -14,7 +14,16 @@ from calib.calibration.localisation.load_windows import FIDELITY
 from jaxeit.contacts import LoadKind, LoadSettings, prepare_loads
 from jaxeit.contacts.loads.comparison import Comparison, Fit, padded
 from jaxeit.contacts.loads.preparation import field_modes
-from jaxeit.contacts.loads.pressure import MOST, SIZE, Form, elongations, line, pressure, shape_directions, spot
+from jaxeit.contacts.loads.pressure import (
+    LOAD_PARAMETERS,
+    MAX_LOADS,
+    Form,
+    elongations,
+    line,
+    pressure,
+    shape_directions,
+    spot,
+)
 from jaxeit.imaging import InverseError
 from jaxeit.model.forward_model import coefficients, transfer
 from tests.compiled import compiled
@@ -114,7 +123,7 @@ def test_three_loads_of_which_two_are_near_are_two(ready):
         places = np.array([0.06, 0.1]) + np.array([[0.0, 0.0], [away[0], 0.0], [away[1], 0.0]])
         three = np.column_stack([places, np.full(3, np.log(0.012)), np.full(3, np.log(20.0))])
         loads, root = padded(three, LoadKind.MORE)[0], np.eye(len(whole.y))
-        curved = np.diag(np.tile([1e6, 1e6, 10.0, 10.0, 0.0, 0.0], MOST))  # places to 1 mm
+        curved = np.diag(np.tile([1e6, 1e6, 10.0, 10.0, 0.0, 0.0], MAX_LOADS))  # places to 1 mm
         fits = {of: Fit(loads, 0.0, curved, root) for of in (LoadKind.ONE, LoadKind.TWO, LoadKind.MORE)}
         alone, found = whole.evidence(LoadKind.MORE, fits[LoadKind.MORE]), whole.evidences(fits)
         assert found[LoadKind.MORE] < alone - 10
@@ -137,8 +146,8 @@ LONG = SPOT.at[4:].set(jnp.array([0.02, 0.01]))
 
 def rows(*loads):
     """All rows of parameters, and their forms."""
-    forms = [Form.LONG if one[4:].any() else Form.ROUND for one in loads] + [Form.ABSENT] * (MOST - len(loads))
-    return jnp.stack([*loads, *[SPOT] * (MOST - len(loads))]), jnp.array(forms)
+    forms = [Form.LONG if one[4:].any() else Form.ROUND for one in loads] + [Form.ABSENT] * (MAX_LOADS - len(loads))
+    return jnp.stack([*loads, *[SPOT] * (MAX_LOADS - len(loads))]), jnp.array(forms)
 
 
 def grid_of_sheet(step=5e-4):
@@ -200,7 +209,7 @@ def test_slopes_are_those_of_the_forward_map(ready, loads, most):
     """
     sheet = ready[0].sheet
     theta, forms = rows(*loads)
-    by_jax = jax.jacfwd(lambda flat: sheet.response(flat, forms))(theta).reshape(-1, MOST * SIZE)
+    by_jax = jax.jacfwd(lambda flat: sheet.response(flat, forms))(theta).reshape(-1, MAX_LOADS * LOAD_PARAMETERS)
     known = compiled(sheet.unknowns, theta, forms)
     np.testing.assert_allclose(
         known.value, compiled(sheet.response, theta, forms), atol=1e-6 * float(jnp.abs(known.value).max())

@@ -7,7 +7,7 @@ from scipy.stats import multivariate_t
 
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import ContactLaw
-from jaxeit.tracking.contact_law import BEYOND, LEAST_SLOPE, MOST, SCATTER, SHAPE, SPREAD, SURE, USUAL
+from jaxeit.tracking.contact_law import BEYOND, LEAST_SLOPE, MAX_LOG_FACTOR, SCATTER, SHAPE, SPREAD, SURE, USUAL
 from jaxeit.tracking.tracks import Track
 
 from .conftest import load
@@ -106,7 +106,7 @@ def test_the_factor_is_bounded():
     assert further.force / far.force == pytest.approx(100)
     assert further.log_force_error == pytest.approx(far.log_force_error)
     wild = law._replace(mean=np.array([-9.0, 0.0, 0.0])).applied(track(8.0, 0.012))
-    assert wild.force == pytest.approx(8 * np.exp(MOST))
+    assert wild.force == pytest.approx(8 * np.exp(MAX_LOG_FACTOR))
     assert law._replace(mean=np.array([0.0, -5.0, 0.0])).slope == LEAST_SLOPE
 
 

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 from jaxeit.contacts.loads.model_error import STEP
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import fit_model_error, model_error, press_evidence
-from jaxeit.tracking.belief.filter import SIZE
+from jaxeit.tracking.belief.filter import CONTACT_SIZE
 from jaxeit.tracking.belief.programs import Programs
 from jaxeit.tracking.preparation import MESH_GAIN
 
@@ -114,7 +114,7 @@ def test_ellipses_hold_places_under_an_error_that_lasts_as_long_as_the_press(hum
         for _ in range(60):
             now = humble.step(now, seen, 5 * SECONDS)
         track = min(now.tracks, key=lambda t, p=place: np.linalg.norm(t.position - p))
-        own = SIZE * now.numbers.index(track.number) + np.arange(2)
+        own = CONTACT_SIZE * now.numbers.index(track.number) + np.arange(2)
         away = track.position - place
         for held, covariance in (
             (by_filter, np.asarray(now.belief.covariance)[np.ix_(own, own)]),

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from jaxeit.tracking.belief.filter import SIZE
+from jaxeit.tracking.belief.filter import CONTACT_SIZE as SIZE
 from jaxeit.tracking.smoothing import Smoother, State, Transition, smoothed, transition
 
 FRAMES, SEEN = 7, 3

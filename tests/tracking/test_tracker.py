@@ -7,7 +7,16 @@ from scipy.stats import norm
 
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import TrackerSettings, prepare_tracker
-from jaxeit.tracking.belief.filter import SEEN, SIZE, WIDER, Pads, active_numbers, predicted, telling_pads, updated
+from jaxeit.tracking.belief.filter import (
+    CONTACT_SIZE,
+    SEEN_SIZE,
+    WIDER,
+    Pads,
+    active_numbers,
+    predicted,
+    telling_pads,
+    updated,
+)
 
 from .conftest import SECONDS, SETTINGS, in_double_precision, load, with_filter
 
@@ -121,7 +130,7 @@ def test_pads_err_by_what_they_would_bear_of_a_wider_load(tracker):
     """Of a load 12 mm from their border, whose integral is known."""
     width, away, given = 0.008, 0.012, np.array([0.3, 0.4, 0.5, np.inf])
     contacts = jnp.array([[*load(0.1 - away, 0.05, 10.0, width), 0.0, 0.0]])
-    near = tracker.filter.sheet.near(contacts[:, :SEEN])
+    near = tracker.filter.sheet.near(contacts[:, :SEEN_SIZE])
     found = telling_pads(tracker.filter, contacts, near, Pads(jnp.zeros(4), jnp.asarray(given))).error
     beyond = norm.sf(away / np.array([width, WIDER * width])) * norm.cdf(0.05 / np.array([width, WIDER * width]))
     expected = np.hypot(given[1], TrackerSettings().tail * 10 * np.diff(beyond)[0])
@@ -165,8 +174,9 @@ def test_an_update_is_the_conditional_normal_distribution(tracker, followed):
     filter_, belief = map(in_double_precision, (tracker.filter, followed[0][6].belief))
     belief = predicted(filter_, belief, jnp.asarray(SECONDS))
     active = np.asarray(active_numbers(filter_, belief.contacts))
-    contacts = belief.contacts[:, :SEEN]
-    shown = filter_.sheet.shown(contacts, belief.gain, jnp.asarray(active[SEEN:] - SIZE), filter_.sheet.near(contacts))
+    contacts = belief.contacts[:, :SEEN_SIZE]
+    modes, near = jnp.asarray(active[SEEN_SIZE:] - CONTACT_SIZE), filter_.sheet.near(contacts)
+    shown = filter_.sheet.shown(contacts, belief.gain, modes, near)
     y, compress = np.asarray(shown.readings), np.asarray(filter_.compress)
     frame = np.linalg.lstsq(compress, y)[0]
     np.testing.assert_allclose(compress @ frame, y, atol=1e-9)

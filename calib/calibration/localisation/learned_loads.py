@@ -10,7 +10,7 @@ from jaxeit.contacts.loads.sheet import scaled_law
 
 from ..calibration import Calibration
 
-FEWEST, MOST = 12, 16  # presses from which loads are learned; more take longer and hardly tell more
+MIN_PRESSES, MAX_PRESSES = 12, 16  # presses from which loads are learned; more take longer and hardly tell more
 
 
 def learned_loads(calibration: Calibration, model: je.Model, known: dict[str, Any]) -> tuple[LoadSettings | None, str]:
@@ -25,9 +25,11 @@ def learned_loads(calibration: Calibration, model: je.Model, known: dict[str, An
     probes = calibration.probes
     if probes is None:
         return None, "nothing, as the calibration kept no presses; calibrate anew"
-    whole = np.flatnonzero(np.isfinite(probes.dv[:, known["channels"]]).all(1))[:MOST]  # each far from those before it
-    if len(whole) < FEWEST:
-        return None, f"nothing, as {len(whole)} presses of the calibration lack no reading, and {FEWEST} are needed"
+    # Each press is far from those before it.
+    whole = np.flatnonzero(np.isfinite(probes.dv[:, known["channels"]]).all(1))[:MAX_PRESSES]
+    if len(whole) < MIN_PRESSES:
+        count = f"{len(whole)} presses of the calibration lack no reading"
+        return None, f"nothing, as {count}, and {MIN_PRESSES} are needed"
     frames, places, forces = probes.dv[whole], probes.position[whole], probes.force[whole]
     try:
         learned = je.contacts.learn_loads(model, frames, places, forces, gain=calibration.layer, **known)

@@ -25,7 +25,7 @@ from .quiet_frames import QuietFrames
 
 # The mesh moves a load by 0.05 mm, a tenth of what the gain of the contact layer does; a draft moves it by 0.15 mm.
 FIDELITY = je.Fidelity(edge_length=0.05, electrode_segments=10, growth=1.5)
-MOST = 3  # loads of a window
+MAX_LOADS = 3  # loads of a window
 # Chi-square over the number of readings of a fit, and part of the windows beyond it from which it is worth a line. On
 # honest skins of another simulator the median reaches 2; where bolts are 2 mm aside it begins at 25.
 SURPRISING, MIN_SURPRISING = 6.0, 0.5
@@ -207,12 +207,12 @@ ABOUT = {
 
 
 EMPTY = {
-    "position": (MOST, 2),
-    "position_covariance": (MOST, 2, 2),
+    "position": (MAX_LOADS, 2),
+    "position_covariance": (MAX_LOADS, 2, 2),
     "ends": (2, 2),
     "ends_covariance": (4, 4),
-    "width": (MOST,),
-    "force": (MOST,),
+    "width": (MAX_LOADS,),
+    "force": (MAX_LOADS,),
 }
 
 

@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from ..result import Contacts
 from .considered import Known, inverse_of, mean_errors, slopes_in_law
-from .pressure import FORCE, MOST, SIZE, Form
+from .pressure import FORCE, LOAD_PARAMETERS, MAX_LOADS, Form
 from .programs import Problem, before, fit_loads, unknowns_of
 from .proposal import Proposed
 from .result import LoadKind, Loads, LoadShape
@@ -52,7 +52,7 @@ class Fit(NamedTuple):
 
     | meaning                                                                   | shape      |
     |---------------------------------------------------------------------------|------------|
-    | loads: parameters of all rows                                             | (MOST, 6)  |
+    | loads: parameters of all rows                                             | (MAX_LOADS, 6)  |
     | square: sum of squares with that of the prior                             | ()         |
     | normal: half the second derivatives of the square, of all parameters      | (18, 18)   |
     | root: Cholesky factor of the covariance of the errors                     | (r, r)     |
@@ -70,17 +70,17 @@ def improbability(fit: Fit) -> float:
 
 
 def free_parameters(forms: np.ndarray) -> np.ndarray:
-    """Which parameters of all rows are fitted, (MOST, 6)."""
-    free: np.ndarray = np.arange(SIZE) < np.array([0, 4, 6])[forms][:, None]
+    """Which parameters of all rows are fitted, (MAX_LOADS, 6)."""
+    free: np.ndarray = np.arange(LOAD_PARAMETERS) < np.array([0, 4, 6])[forms][:, None]
     return free
 
 
 def padded(rows: np.ndarray, kind: LoadKind) -> tuple[np.ndarray, np.ndarray]:
     """All rows of parameters, and their forms."""
-    forms = np.zeros(MOST, np.int32)
+    forms = np.zeros(MAX_LOADS, np.int32)
     forms[: len(FORMS[kind])] = FORMS[kind]
-    rows = np.pad(rows, ((0, 0), (0, SIZE - rows.shape[1])))
-    return np.concatenate([rows, np.repeat(rows[-1:], MOST - len(rows), 0)]), forms
+    rows = np.pad(rows, ((0, 0), (0, LOAD_PARAMETERS - rows.shape[1])))
+    return np.concatenate([rows, np.repeat(rows[-1:], MAX_LOADS - len(rows), 0)]), forms
 
 
 class Comparison:
@@ -219,7 +219,7 @@ class Comparison:
 
     def steps(self, kind: LoadKind, fit: Fit) -> list[np.ndarray]:
         """From the parameters of a fit to the way from one load to another, or along an edge; (2, m) each."""
-        place = [np.eye(2, int(np.count_nonzero(self.free(kind, fit))), k=4 * k) for k in range(MOST)]
+        place = [np.eye(2, int(np.count_nonzero(self.free(kind, fit))), k=4 * k) for k in range(MAX_LOADS)]
         if kind is LoadKind.EDGE:
             return [2 * place[1]]  # after place, width and force come the half lengths
         return [place[j] - place[i] for i, j in PAIRS if j < len(FORMS[kind])]
@@ -247,7 +247,7 @@ class Comparison:
         free = self.free(kind, fit)
         # A place that the frame does not tell is somewhere on the sheet: the variance of an even density bounds it.
         sides = np.asarray(self.fitter.high - self.fitter.low, float)
-        on_sheet = np.tile(np.concatenate([12 / sides**2, np.zeros(SIZE - 2)]), MOST)
+        on_sheet = np.tile(np.concatenate([12 / sides**2, np.zeros(LOAD_PARAMETERS - 2)]), MAX_LOADS)
         sign, volume = np.linalg.slogdet((fit.normal + np.diag(on_sheet))[np.ix_(free, free)])
         noise = np.sum(np.log(np.diag(fit.root)))
         found = self.fitter.log_prior(kind, fit.loads) - 0.5 * fit.square - noise
@@ -285,7 +285,7 @@ class Comparison:
 
     def forces(self, known: Known, free: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Change of the logs of the forces by `ForceLaw`, (n,), and the covariance of all parameters after it."""
-        law, at = self.fitter, np.flatnonzero(np.flatnonzero(free) % SIZE == FORCE)
+        law, at = self.fitter, np.flatnonzero(np.flatnonzero(free) % LOAD_PARAMETERS == FORCE)
         logs, unsure = (np.asarray(part, float) for part in (law.force_logs, law.force_covariance))
         slopes, scale = slopes_in_law(known, free)[at], np.ones(len(covariance))
         scale[at] = np.sqrt(float(law.force_variance))

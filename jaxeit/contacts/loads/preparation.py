@@ -17,7 +17,7 @@ from ...model.forward_model import coefficients, conductivity, transfer
 from ..bump_responses import mean_conductivity, points_of
 from ..preparation import sheet_and_readings
 from .fitter import LoadFitter
-from .pressure import MOST, SIZE, Form
+from .pressure import LOAD_PARAMETERS, MAX_LOADS, Form
 from .settings import LoadSettings
 from .sheet import KnownGain, PressedSheet
 from .starts import Starts
@@ -164,8 +164,8 @@ def _starts(
 
 @verb
 def _atoms(sheet: PressedSheet, rows: Float[Array, "b 4"]) -> Float[Array, "b r"]:
-    forms = jnp.array([Form.ROUND] + [Form.ABSENT] * (MOST - 1))
-    respond = lambda one: sheet.response(jnp.tile(jnp.pad(one, (0, SIZE - 4)), (MOST, 1)), forms)  # noqa: E731
+    forms = jnp.array([Form.ROUND] + [Form.ABSENT] * (MAX_LOADS - 1))
+    respond = lambda one: sheet.response(jnp.tile(jnp.pad(one, (0, LOAD_PARAMETERS - 4)), (MAX_LOADS, 1)), forms)  # noqa: E731
     found: Array = jax.lax.map(respond, rows)
     return found
 

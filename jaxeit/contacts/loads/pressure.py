@@ -1,4 +1,4 @@
-"""Pressure of up to `MOST` loads.
+"""Pressure of up to `MAX_LOADS` loads.
 
 Each load has six parameters: x, y, log width s, log force, and half its length along x and along y. A round load has no
 length. One table of parameters for all kinds of loads means one compiled program for all of them; which rows count,
@@ -15,7 +15,7 @@ import numpy as np
 from jax.scipy.special import erf
 from jaxtyping import Array, Bool, Float, Int
 
-MOST, SIZE = 3, 6  # loads, and parameters of each
+MAX_LOADS, LOAD_PARAMETERS = 3, 6  # loads, and parameters of each
 FORCE = 3  # of these the log of the force
 ROW = (-0.8, 0.0, 0.8)  # of the half length, places of the round loads that an edge is a row of
 LOG_ROW = np.array([0, 0, 0, np.log(len(ROW)), 0, 0])  # by which each of them is weaker

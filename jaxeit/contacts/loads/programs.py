@@ -13,7 +13,7 @@ from ...least_squares import ImplicitStep, normal_equations
 from ...least_squares.searches import HalfSquares
 from ...linalg import lapack
 from ..fit import SOLVER
-from .pressure import MOST, SIZE, Form, Forms, Parameters
+from .pressure import LOAD_PARAMETERS, MAX_LOADS, Form, Forms, Parameters
 from .sheet import Unknowns
 
 if TYPE_CHECKING:
@@ -73,13 +73,13 @@ def before(problem: Problem, loads: Parameters) -> tuple[Float[Array, " s"], Flo
 
 
 def _residual(flat: Float[Array, " m"], problem: Problem) -> Float[Array, " n"]:
-    left = problem.y - problem.fitter.sheet.response(flat.reshape(MOST, SIZE), problem.forms)
+    left = problem.y - problem.fitter.sheet.response(flat.reshape(MAX_LOADS, LOAD_PARAMETERS), problem.forms)
     return jnp.append(lapack.solve_triangular(problem.root, left, lower=True), unusual(flat, problem))
 
 
 def _quadratic(flat: Float[Array, " m"], problem: Problem) -> HalfSquares:
     """The sum of squares near some loads; the sheet knows its slopes."""
-    sheet, loads = problem.fitter.sheet, flat.reshape(MOST, SIZE)
+    sheet, loads = problem.fitter.sheet, flat.reshape(MAX_LOADS, LOAD_PARAMETERS)
     at = sheet.linearised(loads, problem.forms)
     both = jnp.concatenate([(problem.y - at.value)[:, None], -sheet.slopes(at, loads, problem.forms)], 1)
     both = lapack.solve_triangular(problem.root, both, lower=True)
@@ -92,7 +92,8 @@ def unusual(flat: Float[Array, " m"], problem: Problem) -> Float[Array, " s"]:
 
     Log width and log force, of the first load and of the others less those of the first; half lengths of an edge.
     """
-    fitter, loads, there = problem.fitter, flat.reshape(MOST, SIZE), problem.forms[:, None] > Form.ABSENT
+    fitter, loads = problem.fitter, flat.reshape(MAX_LOADS, LOAD_PARAMETERS)
+    there = problem.forms[:, None] > Form.ABSENT
     first = (loads[0, 2:4] - fitter.usual) / fitter.spread
     others = jnp.where(there, (loads[:, 2:4] - loads[0, 2:4]) / fitter.difference, 0)[1:]
     length = jnp.where(problem.forms[:, None] == Form.LONG, loads[:, 4:] / fitter.length, 0)

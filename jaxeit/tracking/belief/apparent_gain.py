@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from ..._compile import verb
 from ...linalg import lapack
-from .filter import SEEN, SIZE, ContactFilter, active_numbers
+from .filter import CONTACT_SIZE, SEEN_SIZE, ContactFilter, active_numbers
 from .response import LoadedSheet
 
 # Distance of the places, in lengths of the field of the gain, and their least and largest number along a side.
@@ -28,7 +28,7 @@ UNTOLD = 3
 
 
 def apparent_gain(
-    tracker: ContactFilter, sheet: LoadedSheet, usual: Float[np.ndarray, "2"], length: float
+    contact_filter: ContactFilter, sheet: LoadedSheet, usual: Float[np.ndarray, "2"], length: float
 ) -> Float[np.ndarray, "g c"]:
     """B of the modes of the gain, (g, c), in their standard deviations.
 
@@ -40,34 +40,34 @@ def apparent_gain(
     modes = sheet.modes.shape[1]
     if not sheet.coat.shape[1]:
         return np.zeros((modes, 0))
-    pixels, exact = np.asarray(sheet.pixels, float), tracker.places.dtype
+    pixels, exact = np.asarray(sheet.pixels, float), contact_filter.places.dtype
     low, high = pixels.min(0), pixels.max(0)
     counts = np.clip(np.ceil((high - low) / (APART * length)), *ALONG).astype(int)
     axes = [a + (b - a) * (np.arange(n) + 0.5) / n for a, b, n in zip(low, high, counts, strict=True)]
     places = np.stack(np.meshgrid(*axes), -1).reshape(math.prod(counts), 2)
     given = (jnp.asarray(values, exact) for values in (places, usual))
-    return np.asarray(_apparent(tracker, sheet, *given), float)
+    return np.asarray(_apparent(contact_filter, sheet, *given), float)
 
 
 @verb
 def _apparent(
-    tracker: ContactFilter, sheet: LoadedSheet, places: Float[Array, "n 2"], usual: Float[Array, "2"]
+    contact_filter: ContactFilter, sheet: LoadedSheet, places: Float[Array, "n 2"], usual: Float[Array, "2"]
 ) -> Float[Array, "g c"]:
     size = sheet.modes.shape[1]
 
     def told(place: Float[Array, "2"]) -> tuple[Int[Array, " b"], Float[Array, "b b"], Float[Array, "b c"]]:
         """Modes that a press tells of, and J^T J and J^T S of these."""
-        contact = jnp.concatenate([place, usual, jnp.zeros(SIZE - len(place) - len(usual), place.dtype)])[None]
-        modes, none = active_numbers(tracker, contact)[SEEN:] - SIZE, jnp.zeros(size, place.dtype)
-        near = sheet.near(contact[:, :SEEN])
-        shown = sheet.shown(contact[:, :SEEN], none, modes, near)
+        contact = jnp.concatenate([place, usual, jnp.zeros(CONTACT_SIZE - len(place) - len(usual), place.dtype)])[None]
+        modes, none = active_numbers(contact_filter, contact)[SEEN_SIZE:] - CONTACT_SIZE, jnp.zeros(size, place.dtype)
+        near = sheet.near(contact[:, :SEEN_SIZE])
+        shown = sheet.shown(contact[:, :SEEN_SIZE], none, modes, near)
         square = shown.readings @ shown.readings / len(shown.readings)
-        scale = jnp.sqrt(1 + tracker.error_share * square)
-        own = tracker.spread[:UNTOLD, None] * shown.reading_slopes[:UNTOLD] / scale
+        scale = jnp.sqrt(1 + contact_filter.error_share * square)
+        own = contact_filter.spread[:UNTOLD, None] * shown.reading_slopes[:UNTOLD] / scale
         root = lapack.cholesky(own @ own.T + jnp.eye(UNTOLD, dtype=own.dtype), lower=True)
-        of_gain = shown.reading_slopes[SEEN:] / scale
+        of_gain = shown.reading_slopes[SEEN_SIZE:] / scale
         rest = of_gain - (of_gain @ own.T) @ lapack.cho_solve((root, True), own)
-        by_sheet = sheet.coat_slopes(contact[:, :SEEN], none, near) / scale
+        by_sheet = sheet.coat_slopes(contact[:, :SEEN_SIZE], none, near) / scale
         return modes, rest @ of_gain.T, rest @ by_sheet.T
 
     modes, normal, towards = jax.lax.map(told, places)

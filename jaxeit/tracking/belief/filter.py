@@ -29,13 +29,13 @@ from ...linalg import lapack
 from .response import LoadedSheet, Near, Shown
 
 # Numbers of a contact: x, y, log width, log force, half an edge along x and y, velocity along x and y.
-SIZE, SEEN = 8, 6
+CONTACT_SIZE, SEEN_SIZE = 8, 6
 # Prior deviation of the place of a contact that begins, m.
-PLACE = 0.012
+PLACE_STD = 0.012
 # Half an edge that is none: what keeps its covariance definite, m.
-ROUND = 1e-4
+ROUND_HALF = 1e-4
 # Share of a load on pads that tell forces, from which the pads tell the force of a contact.
-TOLD = 0.25
+MIN_TOLD_SHARE = 0.25
 # How many times as wide a load is whose tails pads may feel.
 WIDER = 2.0
 # Load on a pad that counts as none, N.
@@ -161,7 +161,12 @@ class ContactFilter(eqx.Module):
 
 
 @verb
-def predicted(tracker: ContactFilter, belief: Belief, seconds: Float[Array, ""]) -> Belief:
+def numbers_of(k: int) -> slice:
+    """Where the numbers of contact k stand in the covariance of a belief."""
+    return slice(CONTACT_SIZE * k, CONTACT_SIZE * (k + 1))
+
+
+def predicted(contact_filter: ContactFilter, belief: Belief, seconds: Float[Array, ""]) -> Belief:
     """The belief so many seconds later: contacts move on, and may change.
 
     What the contacts of now have told of the level is forgotten as they change: the level follows an
@@ -170,10 +175,10 @@ def predicted(tracker: ContactFilter, belief: Belief, seconds: Float[Array, ""])
     count, size = len(belief.contacts), belief.contacts.size
     if not count:
         return belief
-    step = jnp.eye(SIZE).at[:2, 6:].set(seconds * jnp.eye(2))
+    step = jnp.eye(CONTACT_SIZE).at[:2, 6:].set(seconds * jnp.eye(2))
     # A velocity that walks at random: the integrated Wiener process, exactly.
-    walk = jnp.diag(tracker.rates**2 * seconds)
-    drift = tracker.rates[6:] ** 2
+    walk = jnp.diag(contact_filter.rates**2 * seconds)
+    drift = contact_filter.rates[6:] ** 2
     walk = walk.at[:2, :2].add(jnp.diag(drift * seconds**3 / 3))
     walk = walk.at[:2, 6:].add(jnp.diag(drift * seconds**2 / 2)).at[6:, :2].add(jnp.diag(drift * seconds**2 / 2))
     whole = jnp.kron(jnp.eye(count), step)
@@ -181,7 +186,7 @@ def predicted(tracker: ContactFilter, belief: Belief, seconds: Float[Array, ""])
     both = rows.at[:, :size].set(rows[:, :size] @ whole.T)
     covariance = both.at[:size, :size].add(jnp.kron(jnp.eye(count), walk))
     mean, variance = belief.level
-    kept = jnp.exp(-0.5 * tracker.gain_rate**2 * seconds / variance)
+    kept = jnp.exp(-0.5 * contact_filter.gain_rate**2 * seconds / variance)
     forgotten = (
         covariance.at[size].multiply(kept).at[:, size].multiply(kept).at[size, size].add((1 - kept**2) * variance)
     )
@@ -194,7 +199,7 @@ class _Problem(NamedTuple):
 
     | meaning                                                          |
     |------------------------------------------------------------------|
-    | tracker, frame, pads; whole: whether the frame lacks no reading  |
+    | filter, frame, pads; whole: whether the frame lacks no reading   |
     | belief before the frame                                          |
     | active: numbers of the belief that the frame tells of            |
     | factor C of their covariance                                     |
@@ -202,7 +207,7 @@ class _Problem(NamedTuple):
     | near: what is near the contacts before the frame                 |
     """
 
-    tracker: ContactFilter
+    contact_filter: ContactFilter
     frame: Frame
     whole: Bool[Array, ""]
     pads: Pads
@@ -215,11 +220,11 @@ class _Problem(NamedTuple):
 
     def shown(self, z: Float[Array, " a"]) -> Shown:
         """What the frame and the pads show if the active numbers change by C z; with slopes in z."""
-        change, before = self.factor @ z, self.belief.contacts[:, :SEEN]
+        change, before = self.factor @ z, self.belief.contacts[:, :SEEN_SIZE]
         modes = self.active[before.size :] - self.belief.contacts.size
         gain = self.belief.gain.at[modes].add(change[before.size :])
-        contacts = before + change[: before.size].reshape(-1, SEEN)
-        found = self.tracker.sheet.shown(contacts, gain, modes, self.near)
+        contacts = before + change[: before.size].reshape(-1, SEEN_SIZE)
+        found = self.contact_filter.sheet.shown(contacts, gain, modes, self.near)
 
         seen = self._told(found.readings, found.reading_slopes)
         return Shown(seen[0], found.pads, self.factor.T @ seen[1], self.factor.T @ found.pad_slopes)
@@ -227,7 +232,7 @@ class _Problem(NamedTuple):
     def signals(self) -> Float[Array, "K r"]:
         """What each contact shows before the frame, to first order."""
         belief = self.belief
-        (found,) = self._told(self.tracker.sheet.signals(belief.contacts[:, :SEEN], belief.gain, self.near))
+        (found,) = self._told(self.contact_filter.sheet.signals(belief.contacts[:, :SEEN_SIZE], belief.gain, self.near))
         return found
 
     def _told(self, *readings: Array) -> tuple[Array, ...]:
@@ -255,24 +260,26 @@ def _residual(z: Float[Array, " a"], problem: _Problem) -> Float[Array, " n"]:
     return problem.residual(z, problem.shown(z))
 
 
-def active_numbers(tracker: ContactFilter, contacts: Float[Array, "K 8"]) -> Int[Array, " a"]:
+def active_numbers(contact_filter: ContactFilter, contacts: Float[Array, "K 8"]) -> Int[Array, " a"]:
     """Numbers of the belief that a frame tells of: of the contacts, the level, and the modes around contacts."""
     count = len(contacts)
-    own = (SIZE * np.arange(count)[:, None] + np.arange(SEEN)).ravel()
-    known = jnp.asarray([*own, SIZE * count], jnp.int32)
-    square = jnp.min(jnp.sum((tracker.places[1:, None] - contacts[None, :, :2]) ** 2, -1), 1)
-    around = 1 + jax.lax.top_k(-square, min(tracker.active_modes * count, square.size))[1]
-    return jnp.concatenate([known, SIZE * count + around.astype(jnp.int32)])
+    own = (CONTACT_SIZE * np.arange(count)[:, None] + np.arange(SEEN_SIZE)).ravel()
+    known = jnp.asarray([*own, CONTACT_SIZE * count], jnp.int32)
+    square = jnp.min(jnp.sum((contact_filter.places[1:, None] - contacts[None, :, :2]) ** 2, -1), 1)
+    around = 1 + jax.lax.top_k(-square, min(contact_filter.active_modes * count, square.size))[1]
+    return jnp.concatenate([known, CONTACT_SIZE * count + around.astype(jnp.int32)])
 
 
-def _seen(tracker: ContactFilter, dv: Float[Array, " readings"]) -> tuple[Frame, Bool[Array, ""], Float[Array, ""]]:
+def _seen(
+    contact_filter: ContactFilter, dv: Float[Array, " readings"]
+) -> tuple[Frame, Bool[Array, ""], Float[Array, ""]]:
     """A frame as it is fitted, whether it lacks no reading, and the share of the model in the variance of a number."""
-    dv = jnp.asarray(dv, tracker.compress.dtype)
-    y = tracker.compress @ dv  # of channels that are not used the matrix is zero, but not its product with NaN
+    dv = jnp.asarray(dv, contact_filter.compress.dtype)
+    y = contact_filter.compress @ dv  # of channels that are not used the matrix is zero, but not its product with NaN
     whole = jnp.all(jnp.isfinite(y))
-    frame = usually(whole, _complete, lambda finder, _, dv: finder.compressed(dv)[0], tracker.finder, y, dv)
-    whole = whole | jnp.all(jnp.isfinite(dv) | ~tracker.finder.whitening.channels)
-    return frame, whole, tracker.error_share * (frame.y @ frame.y) / len(frame.y)
+    frame = usually(whole, _complete, lambda finder, _, dv: finder.compressed(dv)[0], contact_filter.finder, y, dv)
+    whole = whole | jnp.all(jnp.isfinite(dv) | ~contact_filter.finder.whitening.channels)
+    return frame, whole, contact_filter.error_share * (frame.y @ frame.y) / len(frame.y)
 
 
 def _complete(finder: ContactFinder, y: Float[Array, " r"], dv: Float[Array, " readings"]) -> Frame:
@@ -281,45 +288,45 @@ def _complete(finder: ContactFinder, y: Float[Array, " r"], dv: Float[Array, " r
 
 
 def _problem(
-    tracker: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads, seconds: Float[Array, ""]
+    contact_filter: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads, seconds: Float[Array, ""]
 ) -> _Problem:
-    frame, whole, share = _seen(tracker, dv)
-    scale, alone = _scales(tracker, share, seconds)
-    active = active_numbers(tracker, belief.contacts)
+    frame, whole, share = _seen(contact_filter, dv)
+    scale, alone = _scales(contact_filter, share, seconds)
+    active = active_numbers(contact_filter, belief.contacts)
     factor = lapack.cholesky(belief.covariance[jnp.ix_(active, active)], lower=True)
-    near = tracker.sheet.near(belief.contacts[:, :SEEN])
-    pads = telling_pads(tracker, belief.contacts, near, pads)
-    return _Problem(tracker, frame, whole, pads, belief, active, factor, scale, alone, near)
+    near = contact_filter.sheet.near(belief.contacts[:, :SEEN_SIZE])
+    pads = telling_pads(contact_filter, belief.contacts, near, pads)
+    return _Problem(contact_filter, frame, whole, pads, belief, active, factor, scale, alone, near)
 
 
-def telling_pads(tracker: ContactFilter, contacts: Float[Array, "K 8"], near: Near, pads: Pads) -> Pads:
+def telling_pads(contact_filter: ContactFilter, contacts: Float[Array, "K 8"], near: Near, pads: Pads) -> Pads:
     """Pads with the errors of what they tell of contacts; infinite for pads that hardly tell any.
 
     How much of a load lies on the pads beside it depends on its shape, which is not known: foam spreads a load farther
     than it makes the layer conduct. So pads may err by a part of what a load `WIDER` would change them.
 
-    A pad that mostly bears contacts with less than `TOLD` of their load on pads that tell forces bears their tails, as
-    where the pad under a contact is dead, and those beside it tell forces. The whole force would err tenfold. While
-    there is such a contact, pads without any load count as bearing it.
+    A pad that mostly bears contacts with less than `MIN_TOLD_SHARE` of their load on pads that tell forces bears their
+    tails, as where the pad under a contact is dead, and those beside it tell forces. The whole force would err tenfold.
+    While there is such a contact, pads without any load count as bearing it.
     """
-    own = contacts[:, :SEEN]
-    loads = tracker.sheet.on_pads(own, near)
-    spread = tracker.sheet.on_pads(own.at[:, 2].add(math.log(WIDER)), near) - loads
-    error = jnp.sqrt(pads.error**2 + tracker.tail**2 * jnp.sum(spread**2, 0))
-    told = jnp.sum(jnp.where(jnp.isfinite(pads.error), loads, 0), 1) >= TOLD * jnp.exp(contacts[:, 3])
+    own = contacts[:, :SEEN_SIZE]
+    loads = contact_filter.sheet.on_pads(own, near)
+    spread = contact_filter.sheet.on_pads(own.at[:, 2].add(math.log(WIDER)), near) - loads
+    error = jnp.sqrt(pads.error**2 + contact_filter.tail**2 * jnp.sum(spread**2, 0))
+    told = jnp.sum(jnp.where(jnp.isfinite(pads.error), loads, 0), 1) >= MIN_TOLD_SHARE * jnp.exp(contacts[:, 3])
     of_told = jnp.sum(jnp.where(told[:, None], loads, 0), 0)
     of_others = jnp.sum(jnp.where(told[:, None], 0, loads + NO_LOAD), 0)
     return pads._replace(error=jnp.where(of_told >= of_others, error, jnp.inf))
 
 
 def _scales(
-    tracker: ContactFilter, share: Float[Array, ""], seconds: Float[Array, ""]
+    contact_filter: ContactFilter, share: Float[Array, ""], seconds: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Standard deviations of a whitened reading in a frame so long after the last one, and in a frame by itself.
 
     Errors of the model that stay for n frames are told n times, and count once.
     """
-    repeats = jnp.maximum(tracker.persistence / seconds, 1)
+    repeats = jnp.maximum(contact_filter.persistence / seconds, 1)
     return jnp.sqrt(1 + repeats * share), jnp.sqrt(1 + share)
 
 
@@ -346,7 +353,7 @@ def _begun(problem: _Problem) -> Float[Array, " a"]:
     numbers goes with it, by their covariance.
     """
     count = len(problem.belief.contacts)
-    forces = problem.factor[3 : SEEN * count : SEEN]
+    forces = problem.factor[3 : SEEN_SIZE * count : SEEN_SIZE]
     signals = problem.signals()
     normal = signals @ signals.T
     root = lapack.cholesky(normal + ALIKE * jnp.trace(normal) * jnp.eye(count), lower=True)
@@ -364,28 +371,28 @@ def _begun(problem: _Problem) -> Float[Array, " a"]:
 
 @verb
 def followed(
-    tracker: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads, seconds: Float[Array, ""]
+    contact_filter: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads, seconds: Float[Array, ""]
 ) -> tuple[Belief, Update]:
     """The belief as it is predicted so many seconds after the last frame, and what a frame makes of it."""
-    moved = predicted(tracker, belief, seconds)
-    return moved, updated(tracker, moved, dv, pads, seconds)
+    moved = predicted(contact_filter, belief, seconds)
+    return moved, updated(contact_filter, moved, dv, pads, seconds)
 
 
 @verb
 def updated(
-    tracker: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads, seconds: Float[Array, ""]
+    contact_filter: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads, seconds: Float[Array, ""]
 ) -> Update:
     """The belief after a difference frame (readings,) V and the forces on the pads, seconds after the last frame."""
     if not len(belief.contacts):
-        return _nothing(tracker, belief, dv, pads, seconds)
-    problem = _problem(tracker, belief, dv, pads, seconds)
+        return _nothing(contact_filter, belief, dv, pads, seconds)
+    problem = _problem(contact_filter, belief, dv, pads, seconds)
     found = _fitted(problem, ORDINARY, STEPS, jnp.zeros(len(problem.active), problem.factor.dtype))
     return _update(problem, found.value, found.state)
 
 
 @verb
 def attempted(
-    tracker: ContactFilter,
+    contact_filter: ContactFilter,
     belief: Belief,
     dv: Float[Array, " readings"],
     pads: Pads,
@@ -396,9 +403,9 @@ def attempted(
     Its evidence is that of one frame by itself: what the model errs by in this frame it has not told before.
     """
     if not len(belief.contacts):
-        update = _nothing(tracker, belief, dv, pads, tracker.persistence)
+        update = _nothing(contact_filter, belief, dv, pads, contact_filter.persistence)
         return Attempt(jnp.zeros(0, update.evidence.dtype), None, update.evidence, update.loudness, jnp.asarray(True))
-    problem = _problem(tracker, belief, dv, pads, tracker.persistence)
+    problem = _problem(contact_filter, belief, dv, pads, contact_filter.persistence)
     begin = _begun(problem) if attempt is None else attempt.z
     found = _fitted(problem, CAREFUL, PIECE, begin, None if attempt is None else attempt.state)
     update = _update(problem, found.value, found.state)
@@ -408,23 +415,23 @@ def attempted(
 
 @verb
 def concluded(
-    tracker: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads, attempt: Attempt
+    contact_filter: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads, attempt: Attempt
 ) -> Update:
     """The update to which an attempt has come."""
     if attempt.state is None:
-        return _nothing(tracker, belief, dv, pads, tracker.persistence)
-    return _update(_problem(tracker, belief, dv, pads, tracker.persistence), attempt.z, attempt.state)
+        return _nothing(contact_filter, belief, dv, pads, contact_filter.persistence)
+    return _update(_problem(contact_filter, belief, dv, pads, contact_filter.persistence), attempt.z, attempt.state)
 
 
 @verb
 def unexplained(
-    tracker: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads
+    contact_filter: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads
 ) -> Float[Array, " r"]:
     """What the contacts leave of a frame, (r,), in standard deviations of one frame."""
     if not len(belief.contacts):
-        frame, _, share = _seen(tracker, dv)
+        frame, _, share = _seen(contact_filter, dv)
         return frame.y / jnp.sqrt(1 + share)
-    problem = _problem(tracker, belief, dv, pads, tracker.persistence)
+    problem = _problem(contact_filter, belief, dv, pads, contact_filter.persistence)
     left = (problem.frame.y - problem.shown(jnp.zeros(len(problem.active))).readings) / problem.alone
     root = problem.frame.root
     found: Array = jax.lax.cond(problem.whole, lambda left: left, lambda left: root @ left, left)
@@ -432,11 +439,11 @@ def unexplained(
 
 
 def _nothing(
-    tracker: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads, seconds: Float[Array, ""]
+    contact_filter: ContactFilter, belief: Belief, dv: Float[Array, " readings"], pads: Pads, seconds: Float[Array, ""]
 ) -> Update:
     """The update of a belief without contacts: nothing is learned."""
-    frame, _, share = _seen(tracker, dv)
-    scale, alone = _scales(tracker, share, seconds)
+    frame, _, share = _seen(contact_filter, dv)
+    scale, alone = _scales(contact_filter, share, seconds)
     on_pads = jnp.sum((pads.force / pads.error) ** 2)
     none = jnp.zeros((), frame.y.dtype)
     return Update(
@@ -475,11 +482,11 @@ def _followed(problem: _Problem, z: Float[Array, " a"], root: Float[Array, "a a"
     flat = jnp.concatenate([belief.contacts.ravel(), belief.gain]) + across.T @ z
     size = belief.contacts.size
     found = 0.5 * (covariance + covariance.T)
-    return belief._replace(contacts=flat[:size].reshape(-1, SIZE), gain=flat[size:], covariance=found)
+    return belief._replace(contacts=flat[:size].reshape(-1, CONTACT_SIZE), gain=flat[size:], covariance=found)
 
 
 def _loudness(normal: Float[Array, "a a"], factor: Float[Array, "a a"], count: int) -> Float[Array, " K"]:
     """Length of the readings' slope in each contact's log force: for a weak contact, its signal."""
-    unit = jnp.eye(len(factor), dtype=factor.dtype)[:, 3 : SEEN * count : SEEN]
+    unit = jnp.eye(len(factor), dtype=factor.dtype)[:, 3 : SEEN_SIZE * count : SEEN_SIZE]
     along = lapack.solve_triangular(factor, unit, lower=True)
     return jnp.sqrt(jnp.maximum(jnp.sum(along * (normal @ along - along), 0), 0))

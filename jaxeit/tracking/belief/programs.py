@@ -1,4 +1,4 @@
-"""The compiled programs of a tracker, for calls from a loop in Python."""
+"""The compiled programs of a filter of contacts, for calls from a loop in Python."""
 
 from collections.abc import Callable, Iterator
 
@@ -33,16 +33,19 @@ class Programs:
     `size`: number of whitened readings of a frame.
     """
 
-    def __init__(self, tracker: ContactFilter):
-        self.size = len(tracker.compress)
-        self._followed: Callable[..., tuple[Belief, Update]] = bind(followed, tracker)
-        self._predicted: Callable[..., Belief] = bind(predicted, tracker)
-        self._attempted: Callable[..., Attempt] = bind(attempted, tracker)
-        self._concluded: Callable[..., Update] = bind(concluded, tracker)
-        self._consider_covariance: Callable[..., Array] = bind(consider_covariance, tracker)
-        self._unexplained: Callable[..., Array] = bind(unexplained, tracker)
-        self._atoms, self._starts = np.asarray(tracker.finder.atoms), np.asarray(tracker.finder.starts)[:, :2]
-        self._dtype = tracker.places.dtype
+    def __init__(self, contact_filter: ContactFilter):
+        self.size = len(contact_filter.compress)
+        self._followed: Callable[..., tuple[Belief, Update]] = bind(followed, contact_filter)
+        self._predicted: Callable[..., Belief] = bind(predicted, contact_filter)
+        self._attempted: Callable[..., Attempt] = bind(attempted, contact_filter)
+        self._concluded: Callable[..., Update] = bind(concluded, contact_filter)
+        self._consider_covariance: Callable[..., Array] = bind(consider_covariance, contact_filter)
+        self._unexplained: Callable[..., Array] = bind(unexplained, contact_filter)
+        self._atoms, self._starts = (
+            np.asarray(contact_filter.finder.atoms),
+            np.asarray(contact_filter.finder.starts)[:, :2],
+        )
+        self._dtype = contact_filter.places.dtype
 
     def followed(
         self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads, seconds: float
