@@ -31,6 +31,7 @@ class Limits(NamedTuple):
     | finite: whether infinite ones are refused     |
     | whole: whether fractions are refused          |
     | unit: of the numbers, for messages            |
+    | empty: whether there may be no number at all  |
     """
 
     least: float = -math.inf
@@ -39,6 +40,7 @@ class Limits(NamedTuple):
     finite: bool = True
     whole: bool = False
     unit: str = ""
+    empty: bool = False
 
     def outside(self, value: Any) -> np.ndarray:
         """The numbers of a value, an array or a scalar, that have no meaning; all of what holds no real numbers."""
@@ -68,6 +70,7 @@ def limited(
     finite: bool = True,
     whole: bool | None = None,
     unit: str = "",
+    empty: bool = False,
     **options: Any,
 ) -> Any:
     """A field of a class whose numbers lie from ``least``, or ``above`` a number, to ``most``.
@@ -76,6 +79,7 @@ def limited(
         finite: whether infinite numbers are refused.
         whole: whether fractions are refused; by default where the default is a whole number.
         unit: of the numbers, for messages.
+        empty: whether there may be no number at all.
         options: of `equinox.field`, such as ``static`` and ``converter``.
 
     Example:
@@ -92,7 +96,7 @@ def limited(
             print(error)
     """
     whole = type(default) is int if whole is None else whole
-    limits = Limits(least if above is None else above, most, above is not None, finite, whole, unit)
+    limits = Limits(least if above is None else above, most, above is not None, finite, whole, unit, empty)
     return eqx.field(default=default, metadata={"limits": limits}, **options)
 
 
@@ -119,7 +123,7 @@ def require_limits(thing: Any, error: type[ValueError] = SettingError) -> None:
         limits, value = field.metadata.get("limits"), getattr(thing, field.name)
         if limits is None or value is None or is_traced(value):
             continue
-        if not np.size(value):
+        if not np.size(value) and not limits.empty:
             raise error(f"{type(thing).__name__}: {field.name} is empty; give {limits}")
         if (wrong := limits.outside(value)).size:
             raise error(f"{type(thing).__name__}: {field.name} is {_shown(wrong, limits)}; give {limits}")

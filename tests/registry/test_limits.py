@@ -117,3 +117,9 @@ def test_a_name_is_no_noise():
 def test_what_is_no_hyperparameter_is_refused(weight):
     with pytest.raises(je.imaging.InverseError, match=r"give a number, such as 0\.1, or a way to choose one"):
         je.Imaging(hyperparameter=weight)
+
+
+def test_only_what_may_be_empty_is():
+    assert calib.fitting.logs.SmoothChannels((2,), ()).lags == ()  # no creep
+    with pytest.raises(SettingError, match="GaussianProcess: lengths is empty; give more than 0"):
+        calib.fitting.GaussianProcess(lengths=())

@@ -59,7 +59,7 @@ class SmoothChannels:
     """
 
     directions: tuple[int, ...] = (2, 3, 4, 5, 6)
-    lags: tuple[float, ...] = limited((3.0, 30.0), above=0)
+    lags: tuple[float, ...] = limited((3.0, 30.0), above=0, empty=True)
     start: np.ndarray | None = None
     max_steps: int = limited(MAX_STEPS, least=1)
     coordinates: int = limited(0, least=0)
