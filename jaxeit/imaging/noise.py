@@ -235,14 +235,13 @@ class PairStructure(NamedTuple):
 def structure_of(gram: np.ndarray) -> PairStructure:
     """The structure of G, from its Cholesky factor with pivots: as many pair sums as its rank.
 
-    G is scaled to a diagonal of one before: the rank is that of the pair sums, however unequal the noise of readings.
+    The tolerance is that of the heaviest readings: beside them, what readings of a millionth of their weight add is
+    lost to rounding, and noise whose units differ by 1e60 must not make the rest singular.
     """
-    size = np.sqrt(np.where(gram.diagonal() > 0, gram.diagonal(), 1))
-    upper, pivots, rank, _ = dpstrf(gram / np.outer(size, size), tol=1e-11)
+    upper, pivots, rank, _ = dpstrf(gram, tol=1e-11 * gram.diagonal().max())
     taken, left = np.split(pivots - 1, [rank])
     mixing, null = np.empty((rank, len(gram))), np.zeros((len(gram), len(left)))
-    scaled = solve_triangular(upper[:rank, :rank], upper[:rank, rank:])
-    mixing[:, taken], mixing[:, left] = np.eye(rank), scaled * size[left] / size[taken, None]
+    mixing[:, taken], mixing[:, left] = np.eye(rank), solve_triangular(upper[:rank, :rank], upper[:rank, rank:])
     null[taken], null[left] = -mixing[:, left], np.eye(len(left))
     unit = np.zeros_like(mixing)
     unit[:, taken] = np.eye(rank)

@@ -7,7 +7,8 @@ from scipy.stats import multivariate_normal
 
 import jaxeit as je
 from jaxeit.imaging import InverseError, find_misplacement
-from jaxeit.imaging.absolute.misplacement import COAT_SPREAD, USUAL_COAT, _beliefs
+from jaxeit.imaging.absolute.background import COATING_STD
+from jaxeit.imaging.absolute.misplacement import COAT_SPREAD, _beliefs
 
 from ..helpers import square_model
 from ..oracles.bench.mesh import make_mesh
@@ -28,7 +29,7 @@ def test_the_evidence_and_the_shifts_are_those_of_the_gaussian():
         still = np.eye(40) + ratio**2 * coat @ coat.T + np.outer(gain, gain)
         for belief in _beliefs(ratio, strengths, seen):
             whole = belief.error**2 * still + belief.size**2 * slopes @ slopes.T
-            usual = 0.5 * (np.log(ratio * belief.error / USUAL_COAT) / COAT_SPREAD) ** 2
+            usual = 0.5 * (np.log(ratio * belief.error / COATING_STD) / COAT_SPREAD) ** 2
             surprise.append(belief.surprise - usual + multivariate_normal.logpdf(y, np.zeros(40), whole))
             told = belief.size**2 * slopes.T @ np.linalg.inv(whole)
             np.testing.assert_allclose(belief.shift, told @ y, atol=1e-12)
