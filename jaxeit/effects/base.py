@@ -387,7 +387,7 @@ def fold(effects: Iterable[AbstractEffect], family: type, state: Any, *context: 
 
 
 def _require_same_kind(name: str, before: Any, after: Any) -> None:
-    """Refuse what an effect returns in the place of its argument: another type, or arrays of other shapes."""
+    """Refuse what an effect returns in the place of its argument: another type, other shapes, or fewer digits."""
     if isinstance(before, tuple):
         kind = type(before).__name__
         if not isinstance(after, type(before)):
@@ -400,6 +400,13 @@ def _require_same_kind(name: str, before: Any, after: Any) -> None:
     for what, old, new in pairs:
         if hasattr(old, "shape") and getattr(new, "shape", None) != old.shape:
             raise EffectError(f"{name} returns {what} of shape {getattr(new, 'shape', new)}; it must stay {old.shape}")
+        if hasattr(old, "shape") and _digits(new) < _digits(old):
+            raise EffectError(f"{name} returns {what} in {new.dtype}; it must stay {old.dtype}, as by .astype")
+
+
+def _digits(array: Any) -> float:
+    """Bits of an array of floating-point numbers; infinite for others, such as counts and keys."""
+    return jnp.finfo(array.dtype).bits if jnp.issubdtype(array.dtype, jnp.floating) else np.inf
 
 
 def keys(effects: Iterable[AbstractEffect], key: Key[Array, ""]) -> list[Key[Array, ""]]:

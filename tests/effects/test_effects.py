@@ -386,6 +386,10 @@ def test_effects_of_many_numbers_in_a_scene_file():
             lambda sheet: sheet._replace(sigma=sheet.sigma[:3]),
             r"Wrong returns Sheet.sigma of shape \(3,\); it must stay",
         ),
+        (
+            lambda sheet: sheet._replace(sigma=sheet.sigma.astype(jnp.float32)),
+            "Wrong returns Sheet.sigma in float32; it must stay float64",
+        ),
     ],
 )
 def test_an_effect_returns_what_it_is_given(model, change, message):
