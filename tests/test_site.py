@@ -141,7 +141,7 @@ def test_names_in_docstrings_become_links(names):
         "see [`Noser`][jaxeit.imaging.Noser], [`je.Noser(0.5)`][jaxeit.imaging.Noser], `prior` and [`Noser`](x)"
     )
     assert names.linked("`Noser`, `je.Noser`") == "`Noser`, [`je.Noser`][jaxeit.imaging.Noser]"
-    assert names.linked("see `Bumps`", "jaxeit.contacts.fit") == "see `Bumps`"  # another class of that name
+    assert names.linked("see `Problem`", "jaxeit.contacts.loads.programs") == "see `Problem`"  # another of that name
 
 
 def test_programs_are_found_by_what_they_import(names):
