@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import cholesky, solve_triangular
 
-from ..presses.streams import MAD_TO_SIGMA
+from ..presses.streams import robust_deviation
 
 USUAL = 2.0  # deviations
 STEPS = 30
@@ -101,7 +101,7 @@ def update_gains(
         fitted = free.shape[1] + np.sum(orthogonal[len(gain) :] ** 2)
         # Residuals of a fit are smaller than the errors, as n - fitted to n.
         left = _without(free, covariance, weight, residuals(gain)[0]) * np.sqrt(n / max(n - fitted, 1.0))
-        scatter, misfit = (float(MAD_TO_SIGMA * np.median(np.abs(size))) for size in (left, left / sigma))
+        scatter, misfit = robust_deviation(left), robust_deviation(left / sigma)
         weight = np.minimum(1.0, (1 + USUAL**2) / (1 + (left / sigma / max(misfit, 1.0)) ** 2))
         if np.abs(step).max() < TOLERANCE:
             break

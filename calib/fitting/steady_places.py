@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 import jaxeit as je
 
-from ..presses.streams import MAD_TO_SIGMA
+from ..presses.streams import robust_deviation
 from .fields import Geometry, Places
 from .fields.base import cubic_bspline
 from .fields.geometry import distance, nearest_points
@@ -66,7 +66,7 @@ def _average(
         coefficients = np.linalg.lstsq(features[near].reshape(-1, BUMPS), error[near].ravel(), rcond=None)[0]
         average = features @ coefficients
         shift = np.median((error - average)[near], 0)
-        scatter = MAD_TO_SIGMA * float(np.median(np.abs(error - average - shift)[near]))
+        scatter = robust_deviation((error - average - shift)[near])
         if np.linalg.norm(shift) > LEAST_SHIFT * scatter:
             average = average + shift
         near = use & (np.linalg.norm(error - average, axis=1) <= OUTLYING * max(scatter, LEAST_SCATTER))

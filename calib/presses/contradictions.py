@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .pooled import PooledPresses
-from .streams import MAD_TO_SIGMA
+from .streams import robust_deviation
 
 # How far a press must lie from what the others tell: so many times the usual error, and for a force this part of it,
 # for a place this part of the shorter side of the box of places.
@@ -38,10 +38,9 @@ def contradicted_presses(
 
 
 def _far(error: Float[np.ndarray, " n"], least: Float[np.ndarray, "..."] | float) -> np.ndarray:
-    """Rows of the presses whose error is far larger than usual; none if the usual error is not known."""
+    """Rows of the presses whose error is far larger than usual."""
     known = np.isfinite(error)
-    usual = MAD_TO_SIGMA * np.median(error[known]) if known.any() else np.inf
-    far = np.flatnonzero(known & (error > np.maximum(FAR * usual, least)))
+    far = np.flatnonzero(known & (error > np.maximum(FAR * robust_deviation(error[known]), least)))
     return far if len(far) <= max(1, MAX_SHARE * len(error)) else far[:0]
 
 

@@ -17,7 +17,7 @@ import jaxeit as je
 from jaxeit.geometry.shapes import Polygon
 from jaxeit.linalg.lapack import solve
 
-from .streams import MAD_TO_SIGMA
+from .streams import robust_deviation
 
 ROUNDS = 4  # of the regressions; each uses the pads' own pressures by the round before
 MIN_PLACES = 4  # places far from a pad, and twice the number of other pads; fewer determine no row of the matrix
@@ -135,7 +135,7 @@ def _robust_line(x: np.ndarray, y: np.ndarray, place: np.ndarray) -> tuple[np.nd
         root = np.sqrt(weight)[:, None]
         coefficients = np.linalg.lstsq(x * root, y * root[:, 0], rcond=None)[0]
         left = y - x @ coefficients
-        size = MAD_TO_SIGMA * np.median(np.abs(left))
+        size = robust_deviation(left)
         far = np.abs(left) > HUBER_WIDTH * size
         weight = np.where(far & (size > 0), HUBER_WIDTH * size / np.where(far, np.abs(left), 1), 1)
     scores = np.stack([np.bincount(place, column) for column in (x * (weight * left)[:, None]).T], 1)

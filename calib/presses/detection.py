@@ -9,7 +9,7 @@ from scipy import ndimage
 from jaxeit.registry import limited, require_limits
 
 from .corrections import sample_rate
-from .streams import MAD_TO_SIGMA, PressError, true_runs
+from .streams import PressError, robust_deviation, true_runs
 from .times import PressTimes
 
 Run = tuple[int, int]  # first sample of a run, and the first sample after it
@@ -52,9 +52,7 @@ def noise_level(values: np.ndarray) -> float:
     that mostly repeats one value.
     """
     steps = np.diff(values[np.isfinite(values)])
-    if not len(steps):
-        return 0.0
-    return float(MAD_TO_SIGMA * np.median(np.abs(steps - np.median(steps))) / np.sqrt(2))
+    return robust_deviation(steps - np.median(steps)) / float(np.sqrt(2)) if len(steps) else 0.0
 
 
 def rest_level(force: np.ndarray, width: int) -> np.ndarray:

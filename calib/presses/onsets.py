@@ -8,7 +8,7 @@ import numpy as np
 from ..session.units import SECOND
 from .corrections import TwoSided
 from .samples import remove_baseline
-from .streams import MAD_TO_SIGMA, ReadableStream, index_ranges
+from .streams import ReadableStream, index_ranges, robust_deviation
 from .times import PressColumns
 from .windows import PressWindows
 
@@ -147,7 +147,7 @@ def _onset_delay(delays: np.ndarray) -> OnsetDelay:
 
 
 def _spread(values: np.ndarray) -> float:
-    return float(MAD_TO_SIGMA * np.median(np.abs(values - np.median(values))))
+    return robust_deviation(values - np.median(values))
 
 
 def _change(delay: np.ndarray) -> float:

@@ -9,6 +9,11 @@ import numpy as np
 MAD_TO_SIGMA = 1.4826  # standard deviation of a normal distribution over its median absolute deviation: 1 / Phi^-1(3/4)
 
 
+def robust_deviation(error: np.ndarray) -> float:
+    """Standard deviation about zero by the median of the absolute values, which few outliers do not move; 0 of none."""
+    return float(MAD_TO_SIGMA * np.median(np.abs(error))) if len(error) else 0.0
+
+
 class PressError(ValueError):
     """The streams or the times do not allow a search for presses.
 

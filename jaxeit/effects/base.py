@@ -398,9 +398,11 @@ def _require_same_kind(name: str, before: Any, after: Any) -> None:
     else:
         pairs = [("an array", before, after)]
     for what, old, new in pairs:
-        if hasattr(old, "shape") and getattr(new, "shape", None) != old.shape:
+        if not hasattr(old, "shape"):
+            continue
+        if getattr(new, "shape", None) != old.shape:
             raise EffectError(f"{name} returns {what} of shape {getattr(new, 'shape', new)}; it must stay {old.shape}")
-        if hasattr(old, "shape") and _digits(new) < _digits(old):
+        if _digits(new) < _digits(old):
             raise EffectError(f"{name} returns {what} in {new.dtype}; it must stay {old.dtype}, as by .astype")
 
 

@@ -21,11 +21,12 @@ from calib.calibration.localisation.contact_tracks import (
     NotFollowed,
     pad_errors,
 )
-from calib.calibration.localisation.load_windows import ABOUT as LOAD_ARRAYS, LEARNED, MAX_LOADS
+from calib.calibration.localisation.load_windows import ABOUT as LOAD_ARRAYS, LEARNED
 from calib.calibration.localisation.quiet_frames import QuietFrames
 from calib.cli import main
 from calib.report.track_report import by_number, write_track_report
 from calib.session import read_archive, write_archive
+from jaxeit.contacts.loads.pressure import MAX_LOADS
 from jaxeit.tracking import Track, Tracker, Tracking
 
 from ..helpers import stand_in

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 import jaxeit as je
 from jaxeit.contacts import LoadKind, Loads, LoadSettings, Proposal
+from jaxeit.contacts.loads.pressure import MAX_LOADS
 from jaxeit.registry import SettingError
 
 from ...presses.streams import finite_mean
@@ -25,7 +26,6 @@ from .quiet_frames import QuietFrames
 
 # The mesh moves a load by 0.05 mm, a tenth of what the gain of the contact layer does; a draft moves it by 0.15 mm.
 FIDELITY = je.Fidelity(edge_length=0.05, electrode_segments=10, growth=1.5)
-MAX_LOADS = 3  # loads of a window
 # Chi-square over the number of readings of a fit, and part of the windows beyond it from which it is worth a line. On
 # honest skins of another simulator the median reaches 2; where bolts are 2 mm aside it begins at 25.
 SURPRISING, MIN_SURPRISING = 6.0, 0.5

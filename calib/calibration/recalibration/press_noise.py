@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.spatial.distance import cdist
 
 from ...fitting.pads import FAINT_FORCE
-from ...presses.streams import MAD_TO_SIGMA
+from ...presses.streams import robust_deviation
 from ..evaluation import Evaluation
 
 DEFAULT_SHARE = 0.8  # of the variance that presses at one place have in common, where no place was pressed twice
@@ -55,16 +55,11 @@ def press_noise(found: Evaluation) -> PressNoise:
     error = np.log(found.total_force[sound] / force)
     error = error - np.median(error)
     small = force < np.median(force)
-    fraction = max(_deviation(error[~small]), MIN_FRACTION)
-    more = _deviation(error[small]) ** 2 - fraction**2 if small.sum() >= MIN_HALF else 0.0
+    fraction = max(robust_deviation(error[~small]), MIN_FRACTION)
+    more = robust_deviation(error[small]) ** 2 - fraction**2 if small.sum() >= MIN_HALF else 0.0
     level = float(np.median(force[small])) if small.any() else 0.0
     floor = max(float(np.sqrt(max(more, 0.0))) * level, FAINT_FORCE * fraction * float(force.max(initial=0)))
     return PressNoise(fraction, floor, _share(error, position), place_spacing(position) / 2)
-
-
-def _deviation(error: np.ndarray) -> float:
-    """Robust standard deviation about zero."""
-    return float(MAD_TO_SIGMA * np.median(np.abs(error))) if len(error) else 0.0
 
 
 def place_spacing(position: Float[np.ndarray, "n 2"]) -> float:
@@ -83,6 +78,6 @@ def _share(error: np.ndarray, position: np.ndarray) -> float:
         return DEFAULT_SHARE
     mean = (np.bincount(place, error) / np.maximum(count, 1))[place]
     own = np.sqrt(count / np.maximum(count - 1, 1))[place]  # a mean over few presses is near to each of them
-    whole = _deviation(error)
-    within = _deviation(((error - mean) * own)[count[place] > 1])
+    whole = robust_deviation(error)
+    within = robust_deviation(((error - mean) * own)[count[place] > 1])
     return float(np.clip(1 - (within / whole) ** 2, 0.0, 1.0)) if whole > 0 else DEFAULT_SHARE

@@ -54,8 +54,10 @@ def _of_shape(curve: AbstractCurve, method: str, found: Any, given: Array) -> Ar
     shape = getattr(found, "shape", None)
     if shape != given.shape:
         what = f"of shape {shape}" if shape is not None else f"of type {type(found).__name__}"
-        raise FitError(f"{type(curve).__name__}.{method} returns a result {what} for an array of shape {given.shape}; "
-                       "return one number for each")  # fmt: skip
+        name = f"{type(curve).__name__}.{method}"
+        raise FitError(
+            f"{name} returns a result {what} for an array of shape {given.shape}; return one number for each"
+        )
     return found  # type: ignore[no-any-return]
 
 

@@ -52,7 +52,7 @@ class Fit(NamedTuple):
 
     | meaning                                                                   | shape      |
     |---------------------------------------------------------------------------|------------|
-    | loads: parameters of all rows                                             | (MAX_LOADS, 6)  |
+    | loads: parameters of all `MAX_LOADS` rows                                 | (3, 6)     |
     | square: sum of squares with that of the prior                             | ()         |
     | normal: half the second derivatives of the square, of all parameters      | (18, 18)   |
     | root: Cholesky factor of the covariance of the errors                     | (r, r)     |

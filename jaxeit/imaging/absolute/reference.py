@@ -195,19 +195,7 @@ def fit_reference(
     touches, amplifies = bool(settings.contact or settings.contact_each), bool(settings.common_mode)
     meshed = touches and bool(settings.scale)
     problem = _Problem(model, motion, numbers, channels, touches, meshed, amplifies, level, spread)
-    # Errors far below what is left bend the valley of contacts, where steps become short: begin with large ones.
-    growth = _rms(weight * (known - even / level))
-    x, converged = jnp.zeros(spread.shape[1], known.dtype), jnp.asarray(False)
-    for _ in range(FITS):
-        used = weight / growth
-        x, misfit, converged = _most_probable(problem, known, used, x)
-        growth = jnp.maximum(growth * misfit, 1) if std is None else jnp.ones_like(growth)
-    if not is_traced(converged) and not converged:
-        raise ConvergenceError(
-            f"the fit to the frame does not converge in {MAX_STEPS} steps, as where contacts are better than the mesh "
-            "resolves, or in float32; use float64 (jax_enable_x64), fit fewer unknowns, or keep the contacts of the "
-            "model: contact=0 and contact_each=0"
-        )
+    x, used, converged = _repeated(problem, known, weight, _rms(weight * (known - even / level)), std is None)
     fit, found = _described(problem, known, used, jnp.where(converged, x, jnp.nan))
     used = jnp.where(converged, used, 0)
     hint: Callable[[], str] = str if settings.offset else partial(_with_offset, known, even, used)
@@ -322,6 +310,38 @@ class _Problem(eqx.Module):
         if self.channel is None:
             return readings
         return (1 + parts.gain[self.channel]) * readings + parts.offset[self.channel]
+
+
+def _repeated(
+    problem: _Problem,
+    known: Float[Array, " readings"],
+    weight: Float[Array, " readings"],
+    growth: Float[Array, ""],
+    enlarged: bool,
+) -> tuple[Float[Array, " k"], Float[Array, " readings"], Bool[Array, ""]]:
+    """The most probable unknowns, the weights of the readings in the last fit, and whether it converged.
+
+    Errors far below what is left bend the valley of contacts, where steps become short: fits begin with large ones.
+
+    Args:
+        growth: of the errors in the first fit.
+        enlarged: whether errors grow until the misfit is 1; if not, those of the later fits are as they are given.
+
+    Raises:
+        ConvergenceError: if the last fit does not converge, unless JAX hides that.
+    """
+    x, used, converged = jnp.zeros(problem.spread.shape[1], known.dtype), weight, jnp.asarray(False)
+    for _ in range(FITS):
+        used = weight / growth
+        x, misfit, converged = _most_probable(problem, known, used, x)
+        growth = jnp.maximum(growth * misfit, 1) if enlarged else jnp.ones_like(growth)
+    if not is_traced(converged) and not converged:
+        raise ConvergenceError(
+            f"the fit to the frame does not converge in {MAX_STEPS} steps, as where contacts are better than the mesh "
+            "resolves, or in float32; use float64 (jax_enable_x64), fit fewer unknowns, or keep the contacts of the "
+            "model: contact=0 and contact_each=0"
+        )
+    return x, used, converged
 
 
 @verb
