@@ -111,7 +111,6 @@ def field_slope(
     return felt
 
 
-@verb
 def pair_jacobian(
     model: Model,
     sigma: Float[Array, " elements"] | None,
@@ -120,9 +119,32 @@ def pair_jacobian(
     mixed: Float[Array, "r k"] | None = None,
 ) -> Float[Array, "k basis"] | Float[Array, "r basis"]:
     """Derivative of the transfer matrix's entries for these pairs of electrodes, ohm/S, or of mixtures of them; see
-    `whitening`."""
+    `whitening`.
+
+    Two programs: the images of one model share that of the fields, which takes most of the time to compile.
+    """
+    theta, x = solved_fields(model, sigma)
+    found: Array = _mixed_slopes(model, theta, x.potential, image, electrodes, mixed)
+    return found
+
+
+@verb
+def solved_fields(model: Model, sigma: Float[Array, " elements"] | None) -> tuple[Coefficients, Fields]:
+    """The coefficients for a conductivity, by default the scene's own, and the fields at them."""
     theta = coefficients(model, sigma)
-    slopes = _pair_slopes(model, theta, fields(model, theta).potential, image, electrodes).T
+    return theta, fields(model, theta)
+
+
+@verb
+def _mixed_slopes(
+    model: Model,
+    theta: Coefficients,
+    potential: Float[Array, "n electrodes"],
+    image: BasisMap,
+    electrodes: Integer[ArrayLike, "k 2"],
+    mixed: Float[Array, "r k"] | None,
+) -> Float[Array, "k basis"] | Float[Array, "r basis"]:
+    slopes = _pair_slopes(model, theta, potential, image, electrodes).T
     return slopes if mixed is None else mixed @ slopes
 
 

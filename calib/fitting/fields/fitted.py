@@ -1,8 +1,10 @@
 """A fitted field: its coefficients, their uncertainty, and the gains that it predicts."""
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -62,14 +64,15 @@ class FittedField(eqx.Module):
         the extrapolated field, plus the square of the difference between the two. `error_scale` widens the errors up to
         those at an unknown place.
         """
-        held, there = (self.centred(places, reach) for reach in (self.reach, None))
+        anywhere = jnp.zeros_like(self.reach) + jnp.asarray([[-jnp.inf], [jnp.inf]], self.reach.dtype)
+        held, there = jax.vmap(partial(self.centred, places))(jnp.stack([self.reach, anywhere]))
         between = (there - held) @ self.coefficients
         variance = jnp.einsum("npi,ij,npj->np", there, self.covariance, there) + between**2
         unknown = jnp.maximum(self.spread**2 - self.noise**2, 0)
         variance = jnp.maximum(variance, jnp.minimum(self.error_scale**2 * variance, unknown))
         return LogGain(held @ self.coefficients, jnp.where(places.known, variance, unknown))
 
-    def centred(self, places: Places, reach: Float[Array, "pads 2 2"] | None) -> Float[Array, "n pads m"]:
+    def centred(self, places: Places, reach: Float[Array, "pads 2 2"]) -> Float[Array, "n pads m"]:
         """Features less those of the presses, with contacts inside the box `reach`; 0 where the place is not known."""
         features = pad_features(self.field, self.geometry, places, reach)
         return jnp.where(places.known[..., None] & jnp.isfinite(features), features - self.centre, 0)

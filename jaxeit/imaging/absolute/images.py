@@ -18,8 +18,8 @@ from ...least_squares import Cholesky, ImplicitStep, LeastSquaresState, Levenber
 from ...least_squares.searches import HalfSquares
 from ...model.bases import BasisMap, Picture
 from ...model.discretisation import Model
-from ...model.forward_model import forward
-from ...model.sensitivity import scaled_jacobian
+from ...model.forward_model import forward, terminal_matrix, voltages
+from ...model.sensitivity import field_jacobian, scaled_jacobian, solved_fields
 from ...registry import AbstractChoice, limited
 from ..priors import AbstractPrecision
 
@@ -49,6 +49,13 @@ class LogConductivity(eqx.Module):
         """Derivative of the readings with respect to the image, V: each element's share times its conductivity."""
         sigma = self.sigma(x)
         return scaled_jacobian(self.model, sigma, self.image, sigma)
+
+    def linearised(self, x: Float[Array, " basis"]) -> tuple[Float[Array, " readings"], Float[Array, "readings basis"]]:
+        """`voltages` and `slopes` of an image x, (basis,), from one factorisation."""
+        sigma = self.sigma(x)
+        theta, found = solved_fields(self.model, sigma)
+        readings = voltages(self.model, terminal_matrix(self.model, theta, found))
+        return readings, field_jacobian(self.model, theta, found, self.image, sigma)
 
 
 class AbstractPenalty(AbstractChoice):
@@ -181,8 +188,8 @@ class ImagePosterior(AbstractPosterior):
     def quadratic(self, x: Float[Array, " basis"]) -> HalfSquares:
         """Gauss and Newton's quadratic of the misfits, plus that of the penalty's matrix."""
         picture = self.physics.image.picture
-        missed = self.weight * (self.readings - self.physics.voltages(x))
-        data = normal_equations(missed, -self.weight[:, None] * self.physics.slopes(x))
+        found, slopes = self.physics.linearised(x)
+        data = normal_equations(self.weight * (self.readings - found), -self.weight[:, None] * slopes)
         matrix = self.penalty.matrix(picture, x)
         value = data.f + self.penalty.value(picture, x)
         return quadratic(value, data.grad + matrix @ x, data.hessian.matrix + matrix)

@@ -25,9 +25,9 @@ from scipy.linalg import eigh
 from ..._compile import require_known, verb
 from ...model.bases import Pixels
 from ...model.discretisation import Model
-from ...model.forward_model import coefficients, fields, terminal_matrix, voltages
+from ...model.forward_model import Coefficients, Fields, terminal_matrix, voltages
 from ...model.motion import Motion, electrode_motion, field_shift_jacobian
-from ...model.sensitivity import field_jacobian
+from ...model.sensitivity import field_jacobian, solved_fields
 from ..noise import InverseError, real_numbers, require_real
 from .background import (
     COATING_COLUMNS,
@@ -96,7 +96,7 @@ def find_misplacement(
     physics = even_coat(model, frame, Pixels(COATING_COLUMNS).on(model))
     penalty = Quadratic(coat_precision(physics.image, COATING_LENGTH), 1 / jnp.asarray(COATING_STD) ** 2)
     coat = gauss_newton(physics, penalty, frame, frame_error(frame, COATING_ERROR))
-    linear = _linear(physics, electrode_motion(model), coat)
+    linear = _linear(physics, electrode_motion(model), coat, *solved_fields(model, physics.sigma(coat)))
     error = np.asarray(frame_error(frame, MODEL_ERROR), float)
     spread = np.zeros_like(error) if noise is None else real_numbers("noise", noise, "V")
     if spread.shape != error.shape or not (spread >= 0).all():
@@ -111,19 +111,17 @@ def find_misplacement(
 
 @verb
 def _linear(
-    physics: LogConductivity, motion: Motion, coat: Float[Array, " basis"]
+    physics: LogConductivity, motion: Motion, coat: Float[Array, " basis"], theta: Coefficients, x: Fields
 ) -> tuple[
     Float[Array, "readings basis"],
     Float[Array, "readings both"],
     Float[Array, " readings"],
     Float[Array, " readings"],
 ]:
-    """About a coat: derivatives of the readings by independent parts of the coat, and by all shifts, V and V/m; the
-    readings of an even sheet by these derivatives; and the readings, V."""
-    model, sigma = physics.model, physics.sigma(coat)
-    theta = coefficients(model, sigma)
-    x = fields(model, theta)
-    by_coat = field_jacobian(model, theta, x, physics.image, sigma)
+    """About a coat, from the fields x at its coefficients theta: derivatives of the readings by independent parts of
+    the coat, and by all shifts, V and V/m; the readings of an even sheet by these derivatives; and the readings, V."""
+    model = physics.model
+    by_coat = field_jacobian(model, theta, x, physics.image, theta.sigma)
     by_shift = field_shift_jacobian(model, motion, theta, x)
     found = voltages(model, terminal_matrix(model, theta, x))
     parts = coat_precision(physics.image, COATING_LENGTH).seen(by_coat)
