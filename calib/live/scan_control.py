@@ -22,8 +22,23 @@ def prepare_director(calibration: Calibration, number: int, send: Callable[[byte
     """
     model = je.discretise(je.Scene(calibration.skin), je.Fidelity.draft())
     onset = ONSET_FRACTION * np.asarray(calibration.curves.pressure_range)[:, 1]
-    scan = je.scan.prepare_event_scan(model, calibration.skin, je.scan.EventScanSettings(onset=onset))
+    scan = je.scan.prepare_event_scan(
+        model,
+        calibration.skin,
+        je.scan.EventScanSettings(onset=onset),
+        noise=_reading_noise(calibration.recon),
+        channels=np.asarray(calibration.recon.channels),
+    )
     return ScanDirector(scan, number, send)
+
+
+def _reading_noise(recon: je.imaging.AbstractReconstructor) -> np.ndarray:
+    """Standard deviation of each reading, (readings,) V; 1 for channels that the calibration does not use."""
+    rows, weight = np.flatnonzero(recon.channels), np.asarray(recon.whitening.weight, float)
+    variance = np.ones(len(weight))
+    known = weight[rows][:, rows] if weight.ndim == 2 else np.diag(weight[rows])
+    variance[rows] = np.diag(np.linalg.solve(known, np.eye(len(rows))))
+    return np.sqrt(variance)
 
 
 class ScanDirector:

@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._compile import verb
 from ..imaging.methods import Problem
-from ..imaging.noise import InverseError, noise_weight
+from ..imaging.noise import InverseError, known_flags, noise_weight, require_some
 from ..imaging.priors import AbstractPrior, Noser
 from ..model.bases import AbstractBasis, BasisMap, Picture, Pixels
 from ..model.discretisation import Model
@@ -34,6 +34,7 @@ def signal_covariance(
     *,
     sigma: Float[Array, " elements"] | None = None,
     region: Float[ArrayLike, "... basis"] | None = None,
+    channels: Bool[ArrayLike, " readings"] | None = None,
 ) -> Float[Array, "... readings readings"]:
     """Covariance K of the readings under the prior, in units of their noise.
 
@@ -49,13 +50,14 @@ def signal_covariance(
         region: weights of the places where changes are expected, (basis,) 0 to 1 (`around`, or the weights of
             `pad_masks`), which multiply the prior's variances.  The strength of the prior remains that of the whole
             sheet.  Leading axes hold several regions.
+        channels: readings that the device can take; the others have a covariance of zero; default: all.
 
     Raises:
-        InverseError: if the noise is not one positive number per reading.
+        InverseError: if the noise is not one positive number per reading that is used, or no reading is used.
     """
     image = basis if isinstance(basis, BasisMap) else (basis or Pixels()).on(model)
     flat = jnp.ones(image.size, model.dtype) if region is None else jnp.asarray(region, model.dtype)
-    return covariance_of_region(model, prior or Noser(), image, noise, hyperparameter, sigma)(flat)
+    return covariance_of_region(model, prior or Noser(), image, noise, hyperparameter, sigma, channels)(flat)
 
 
 def covariance_of_region(
@@ -65,33 +67,30 @@ def covariance_of_region(
     noise: Float[ArrayLike, " readings"] | None,
     hyperparameter: Float[ArrayLike, ""],
     sigma: Float[Array, " elements"] | None,
+    channels: Bool[ArrayLike, " readings"] | None = None,
 ) -> Callable[[Float[Array, "... basis"]], Float[Array, "... readings readings"]]:
     """`signal_covariance` as a function of the region, so that many regions share one Jacobian."""
-    readings = model.readings
-    std = jnp.ones(readings) if noise is None else _standard_deviations(noise, readings)
-    strength = jnp.asarray(hyperparameter, model.dtype)
-    return partial(_signal, jacobian(model, sigma, image), std.astype(model.dtype), prior, strength, image)
-
-
-def _standard_deviations(noise: Float[ArrayLike, " readings"], readings: int) -> Float[Array, " readings"]:
-    if np.ndim(noise) != 1:
+    if noise is not None and np.ndim(noise) != 1:
         raise InverseError(
-            f"noise has shape {np.shape(noise)}; give one standard deviation per reading, ({readings},) V"
+            f"noise has shape {np.shape(noise)}; give one standard deviation per reading, ({model.readings},) V"
         )
-    return jnp.asarray(noise_weight(noise, readings, np.ones(readings, bool)) ** -0.5)
+    used = np.ones(model.readings, bool) if channels is None else known_flags(channels, model.readings)
+    weight = jnp.asarray(noise_weight(noise, model.readings, require_some(used)))
+    strength = jnp.asarray(hyperparameter, model.dtype)
+    return partial(_signal, jacobian(model, sigma, image), weight.astype(model.dtype), prior, strength, image)
 
 
 @verb
 def _signal(
     j: Float[Array, "readings basis"],
-    std: Float[Array, " readings"],
+    weight: Float[Array, " readings"],
     prior: AbstractPrior,
     hyperparameter: Float[Array, ""],
     image: BasisMap,
     region: Float[Array, "... basis"],
 ) -> Float[Array, "... readings readings"]:
-    j = j / std[:, None]
-    problem = Problem(j, jnp.asarray(len(j), j.dtype), hyperparameter, prior, image.picture)
+    j = j * jnp.sqrt(weight)[:, None]
+    problem = Problem(j, jnp.sum(weight > 0, dtype=j.dtype), hyperparameter, prior, image.picture)
     precision = problem.precision()
     strength = problem.strength(precision.solve(j.T))
 

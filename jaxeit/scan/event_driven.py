@@ -163,6 +163,7 @@ def prepare_event_scan(
     noise: Float[ArrayLike, " readings"] | None = None,
     hyperparameter: float = 0.1,
     sigma: Float[Array, " elements"] | None = None,
+    channels: Bool[ArrayLike, " readings"] | None = None,
 ) -> EventScan:
     """Compute the tables of an `EventScan` for a skin with pads, on the host.
 
@@ -172,9 +173,11 @@ def prepare_event_scan(
         settings: numbers of readings, limits of pressure and radius.
         basis: an image of pixels; default `Pixels`, 20 along x.
         noise, hyperparameter, sigma: as for `signal_covariance`.
+        channels: readings that tell something; a dead one is in whole scans only, which show whether it is repaired.
 
     Raises:
         ProtocolError: if the skin has no pads, or a setting is out of range.
+        InverseError: as for `signal_covariance`.
 
     Example:
         # Pa, readings, readings, m
@@ -186,16 +189,16 @@ def prepare_event_scan(
             state, readings = scan.step(state, jnp.array(pressure))
             print(int(readings.sum()), "readings to take next")
     """
-    require_known(
-        "prepare_event_scan", ProtocolError, model, settings.onset, settings.release, noise, hyperparameter, sigma
-    )
+    given = model, settings.onset, settings.release, noise, hyperparameter, sigma, channels
+    require_known("prepare_event_scan", ProtocolError, *given)
     _require_pads(skin)
     begins, ends = settings.limits(len(skin.pads))
     image = basis if isinstance(basis, BasisMap) else (basis or Pixels(20)).on(model)
     centres = _grid(skin.domain, settings.radius)
     places = jnp.stack([around(image.picture, centre, settings.radius) for centre in centres])
-    expected = covariance_of_region(model, Noser(), image, noise, hyperparameter, sigma)
-    chosen = partial(_chosen_readings, model, settings, expected)
+    expected = covariance_of_region(model, Noser(), image, noise, hyperparameter, sigma, channels)
+    useful = np.arange(model.readings) if channels is None else np.flatnonzero(np.asarray(channels))
+    chosen = partial(_chosen_readings, model, settings, expected, useful)
     return EventScan(
         idle=chosen(jnp.ones((1, image.size)), settings.idle)[0],
         by_pad=chosen(pad_masks(skin, image).weights, settings.local),
@@ -221,21 +224,22 @@ def _chosen_readings(
     model: Model,
     settings: EventScanSettings,
     expected: Callable[[Float[Array, " basis"]], Float[Array, "readings readings"]],
+    useful: Int[np.ndarray, " n"],
     regions: Float[Array, "regions basis"],
     count: int,
 ) -> Bool[Array, "regions readings"]:
-    """The readings to take for each region, of which it shows most: ``count`` of them, or all.
+    """The useful readings to take for each region, of which it shows most: ``count`` of them, or all.
 
     Args:
         expected: covariance of the readings, of changes in a region.
     """
-    covariances = (expected(region.astype(model.dtype)) for region in regions)
+    pattern, count = model.pattern[useful], min(count, len(useful))
+    covariances = (expected(region.astype(model.dtype))[useful][:, useful] for region in regions)
     rows = [
-        choose_readings(k, min(count, len(k)), settings.selection, pattern=model.pattern, switch=settings.switch).rows
-        for k in covariances
+        choose_readings(k, count, settings.selection, pattern=pattern, switch=settings.switch).rows for k in covariances
     ]
-    none = jnp.zeros((len(rows), model.pattern.shape[0]), bool)
-    return none.at[jnp.arange(len(rows))[:, None], jnp.stack(rows)].set(True)
+    none = jnp.zeros((len(rows), model.readings), bool)
+    return none.at[jnp.arange(len(rows))[:, None], jnp.asarray(useful)[jnp.stack(rows)]].set(True)
 
 
 def _grid(domain: Domain, pitch: float) -> Float[np.ndarray, "regions 2"]:

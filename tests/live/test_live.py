@@ -1034,7 +1034,8 @@ def test_an_event_driven_scan_of_the_testbed_finds_the_contact_with_a_fraction_o
     recon = je.prepare(model, basis=pixels)
     masks, owner = je.pad_masks(skin, recon), np.asarray(je.pad_masks(skin, recon).weights)
     curves = stand_in(FittedCurve, pressure_range=np.tile([0.0, 4000.0], (len(skin.pads), 1)))
-    director = prepare_director(stand_in(calib.Calibration, skin=skin, curves=curves), 1, lambda data: None)
+    stood_in = stand_in(calib.Calibration, skin=skin, curves=curves, recon=recon)
+    director = prepare_director(stood_in, 1, lambda data: None)
     place = np.array([0.06, 0.15])
     centres, v0 = np.asarray(model.centroids), np.asarray(je.forward(model))
     bump = 0.3 * np.exp(-0.5 * ((centres - place) ** 2).sum(1) / 0.012**2)
@@ -1052,6 +1053,21 @@ def test_an_event_driven_scan_of_the_testbed_finds_the_contact_with_a_fraction_o
         centre[pad] = force @ np.asarray(recon.centres) / force.sum()
         assert director.requested.sum() < 0.3 * recon.readings
         assert np.linalg.norm(centre[pad] - place) < 0.015
+
+
+@pytest.mark.parametrize("correlated", [False, True])
+def test_an_event_driven_scan_uses_the_channels_and_the_noise_of_the_calibration(
+    model, skin, pixels, monkeypatch, correlated
+):
+    std = np.linspace(1e-6, 3e-6, 550)  # V
+    used = np.arange(550) % 9 > 0
+    recon = je.prepare(model, basis=pixels, noise=np.diag(std**2) if correlated else std, channels=used)
+    curves = stand_in(FittedCurve, pressure_range=np.tile([0.0, 4000.0], (len(skin.pads), 1)))
+    given = {}
+    monkeypatch.setattr(je.scan, "prepare_event_scan", lambda *_, **known: given.update(known) or small_scan())
+    prepare_director(stand_in(calib.Calibration, skin=skin, curves=curves, recon=recon), 1, lambda data: None)
+    np.testing.assert_array_equal(given["channels"], used)
+    np.testing.assert_allclose(given["noise"][used], std[used], rtol=1e-9)
 
 
 @pytest.mark.slow

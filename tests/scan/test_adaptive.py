@@ -234,6 +234,34 @@ def test_a_short_scan_has_no_more_readings_than_it_has(model, skin, pixels):
     assert scan.by_pad.all()
 
 
+def test_dead_channels_are_in_no_choice_of_readings(model, skin, pixels, scan):
+    settings = je.scan.EventScanSettings(onset=200.0, idle=12, local=30, every=5, radius=0.1)
+    dead = np.asarray(scan.idle)  # those that a scan at rest would take
+    noise = np.where(dead, np.nan, 1e-5)  # V; of a dead channel nothing is known
+    other = je.scan.prepare_event_scan(model, skin, settings, basis=pixels, noise=noise, channels=~dead)
+    for chosen, count in ((other.idle[None], 12), (other.by_pad, 30), (other.by_place, 30)):
+        assert not (np.asarray(chosen) & dead).any()
+        assert (np.asarray(chosen).sum(1) == count).all()
+
+
+def test_a_scan_of_few_channels_takes_no_dead_ones(model, skin, pixels):
+    few = np.arange(550) < 20
+    settings = je.scan.EventScanSettings(onset=200.0, radius=0.1)
+    scan = je.scan.prepare_event_scan(model, skin, settings, basis=pixels, channels=few)
+    np.testing.assert_array_equal(scan.by_pad, np.tile(few, (4, 1)))
+
+
+def test_unused_readings_have_no_covariance(model, pixels):
+    used, noise = np.arange(550) % 7 > 0, np.linspace(1, 2, 550)
+    part = je.scan.signal_covariance(model, basis=pixels, noise=noise, channels=used)
+    whole = np.asarray(je.scan.signal_covariance(model, basis=pixels, noise=np.where(used, noise, 1e6)))
+    assert not np.asarray(part)[~used].any()
+    shape = np.asarray(part)[used][:, used] / whole[used][:, used]  # the strength of the prior counts used readings
+    np.testing.assert_allclose(shape, shape[0, 0], rtol=1e-4)
+    with pytest.raises(je.imaging.InverseError, match="every channel is left out"):
+        je.scan.signal_covariance(model, basis=pixels, channels=np.zeros(550, bool))
+
+
 def test_an_event_scan_needs_pads(model, skin):
     bare = je.Skin("bare", skin.domain, skin.sheet_resistance, skin.electrodes, skin.protocol)
     with pytest.raises(je.skin.ProtocolError, match="has no pads"):
