@@ -18,7 +18,7 @@ from .._compile import verb
 from ..least_squares import quadratic
 from ..least_squares.searches import HalfSquares
 from ..model.bases import Picture
-from .absolute.background import require_positive
+from .absolute.frames import require_positive
 from .absolute.images import AbstractPosterior, ImagePosterior, Quadratic, most_probable
 from .noise import InverseError
 from .priors import AbstractPrior, Laplace

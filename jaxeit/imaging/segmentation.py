@@ -21,7 +21,7 @@ from ..model.bases import AbstractBasis, AbstractPictured, BasisMap, Picture
 from ..model.discretisation import Model, require_model
 from ..model.forward_model import forward
 from ..model.metal_sheet import containing_triangles
-from .absolute.background import require_frame, require_positive
+from .absolute.frames import checked_frame, require_positive
 from .absolute.images import (
     AbstractPenalty,
     ImagePosterior,
@@ -30,7 +30,7 @@ from .absolute.images import (
 )
 from .absolute.one_frame import believed_image, picture_basis, variation_of
 from .level_set import LevelSet, fitted_level, signed_distances
-from .noise import InverseError, require_real
+from .noise import InverseError
 
 UNCHANGED, RESISTIVE, CONDUCTIVE = 0, 1, 2
 """The classes."""
@@ -151,7 +151,7 @@ def segment(
     require_positive(**{f"regions.{name}": value for name, value in vars(regions).items()})
     image = picture_basis(model, basis)
     penalty = variation_of(seen.used(model.dtype)) if penalty is None else penalty
-    physics = LogConductivity(model, image, jnp.average(model.background, weights=model.areas))
+    physics = LogConductivity(model, image, model.mean_background)
     found, std, _ = believed_image(physics, penalty, seen.target, lambda growth: seen.std(errors, growth))
     grid = on_grid(found, image.picture, (regions.pixels, regions.pixels))
     classes = half_height_classes(grid, regions.floor, regions.least, regions.weakest)
@@ -200,10 +200,8 @@ def _seen(
     missed: Float[ArrayLike, " readings"] | None,
 ) -> _Seen:
     """The readings of both frames; raises InverseError for what is no frame of the model."""
-    require_real(reference=reference, frame=frame)
-    before, after, even = jnp.asarray(reference, model.dtype), jnp.asarray(frame, model.dtype), forward(model)
-    for values in (before, after):
-        require_frame(values, even)
+    even = forward(model)
+    before, after = (checked_frame(*one, even) for one in (("reference", reference), ("frame", frame)))
     return _Seen(even, before, after - before, before - even if missed is None else jnp.asarray(missed, model.dtype))
 
 

@@ -89,6 +89,11 @@ class Model(eqx.Module):
         return self.contact.shape[0]
 
     @property
+    def mean_background(self) -> Float[Array, ""]:
+        """Mean of the background over the area of the sheet, S."""
+        return jnp.average(self.background, weights=self.areas)
+
+    @property
     def mesh(self) -> Mesh:
         """The mesh, as arrays of NumPy in float64: for `je.meshing.write_mesh`, or another scene."""
         nodes, chart = np.asarray(self.nodes, float), np.asarray(self.chart, float)

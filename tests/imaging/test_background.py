@@ -52,7 +52,7 @@ def test_the_field_is_found_whatever_the_gain_and_without_a_reading(model, untou
 @pytest.mark.slow
 def test_a_fitted_sheet_states_its_error(model):
     """Coats of the prior, and readings that err by 1 %: intervals of 90 % hold the logarithm of the conductivity."""
-    physics = even_coat(model, je.forward(model), je.Pixels(20).on(model))
+    _, physics = even_coat("v0", model, je.forward(model), je.Pixels(20).on(model))
     precision = np.asarray(coat_precision(physics.image, 0.03).matrix())
     held = []
     for seed in range(3):

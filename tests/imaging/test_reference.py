@@ -9,7 +9,7 @@ import pytest
 
 import jaxeit as je
 from jaxeit.imaging import InverseError, ReferenceSettings, fit_reference
-from jaxeit.imaging.absolute.background import frame_error
+from jaxeit.imaging.absolute.frames import frame_error
 
 from ..helpers import skin_of
 from ..oracles.disc import even_disc

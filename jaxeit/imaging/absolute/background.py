@@ -1,7 +1,6 @@
 """The conductivity of an untouched sheet, from a frame of it."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,13 +9,13 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from ..._compile import is_traced, verb
 from ...kinds import stated
 from ...model.bases import BasisMap, Pixels
 from ...model.discretisation import Model
 from ...model.forward_model import CoatedSheet, forward
 from ..noise import InverseError, require_real
 from ..priors import AbstractPrecision, GaussianSmooth
+from .frames import checked_frame, frame_error, require_explained, require_positive, sheet_level
 from .images import ImagePosterior, LogConductivity, Quadratic, most_probable, reading_weights
 
 # What is believed of a real coating: standard deviation of the logarithm of its conductivity, distance over which it
@@ -24,13 +23,8 @@ from .images import ImagePosterior, LogConductivity, Quadratic, most_probable, r
 COATING_STD, COATING_LENGTH, COATING_COLUMNS = 0.15, 0.03, 20
 # Relative error of a reading, from mesh, electrodes and current as they are modelled, and tolerance of the fit.
 COATING_ERROR, TOLERANCE = 1e-2, 2e-3
-# Smallest error of a reading, as a fraction of the root mean square of all: no reading is modelled better.
-ERROR_FLOOR = 1e-3
 # Steps of the fit, and share of the variance of its error that is kept.
 STEPS, ERROR_VARIANCE = 12, 0.95
-# Largest fraction of the readings that may stay unexplained. A larger one means another skin, another order of the
-# readings or a wrong polarity.
-MAX_UNEXPLAINED = 0.1
 
 
 def fit_background(
@@ -75,14 +69,14 @@ def fit_background(
         truth = je.conductivity(real)
         print(jnp.std(jnp.log(sigma / truth)), "of", jnp.std(jnp.log(truth)), "left")
     """
-    require_real(v0=v0)
-    frame = jnp.asarray(v0, model.dtype)
     require_positive(std=std, length=length, model_error=model_error, columns=columns)
-    physics = even_coat(model, frame, Pixels(columns).on(model) if basis is None else basis)
-    return _fitted(physics, frame, std, length, model_error, tolerance)[0]
+    image = Pixels(columns).on(model) if basis is None else basis
+    frame, physics = even_coat("v0", model, v0, image)
+    return _fitted("v0", physics, frame, std, length, model_error, tolerance)[0]
 
 
 def _fitted(
+    name: str,
     physics: LogConductivity,
     frame: Float[Array, " readings"],
     std: Float[ArrayLike, ""],
@@ -90,12 +84,16 @@ def _fitted(
     model_error: Float[ArrayLike, ""],
     tolerance: float,
 ) -> tuple[Float[Array, " elements"], Float[Array, "basis basis"]]:
-    """The most probable conductivity of `fit_background`, S, and the precision of the logarithm of its pixels."""
+    """The most probable conductivity of `fit_background`, S, and the precision of the logarithm of its pixels.
+
+    Args:
+        name: of the argument that is the frame, for messages.
+    """
     penalty = Quadratic(coat_precision(physics.image, length), 1 / jnp.asarray(std) ** 2)
     weight, readings = reading_weights(frame, frame_error(frame, model_error))
     posterior, start = ImagePosterior(physics, penalty, readings, weight), jnp.zeros(physics.image.size, frame.dtype)
     x, state = most_probable(posterior, start, STEPS, tolerance)
-    require_explained("coating", physics.voltages(x), readings, jnp.isfinite(frame))
+    require_explained(name, "coating", physics.voltages(x), readings, jnp.isfinite(frame))
     return physics.sigma(x), state.quadratic.hessian.matrix
 
 
@@ -114,27 +112,39 @@ def fitted_sheet(model: Model, v0: Float[Array, " readings"]) -> UntouchedSheet:
     hold `ERROR_VARIANCE` of it.
 
     Raises:
-        InverseError: as for `fit_background`.
+        InverseError: as for `fit_background`, of an argument ``untouched``.
     """
-    physics = even_coat(model, v0, Pixels(COATING_COLUMNS).on(model))
-    sigma, precision = _fitted(physics, v0, COATING_STD, COATING_LENGTH, COATING_ERROR, TOLERANCE)
+    sigma, precision, image = _untouched_sheet(model, v0)
     values, vectors = np.linalg.eigh(np.asarray(precision, float))  # ascending: the largest variances first
     share = np.cumsum(1 / values) / np.sum(1 / values)
     count = 1 + int(np.searchsorted(share, ERROR_VARIANCE))
     pixels = jnp.asarray((vectors / np.sqrt(values))[:, :count].T, sigma.dtype)
-    return UntouchedSheet(sigma, np.asarray(jax.vmap(physics.image.expand)(pixels), float).T)
+    return UntouchedSheet(sigma, np.asarray(jax.vmap(image.expand)(pixels), float).T)
 
 
-def even_coat(model: Model, v0: Float[Array, "..."], image: BasisMap) -> LogConductivity:
-    """The physics of a coat about the even sheet nearest to a frame.
+def _untouched_sheet(
+    model: Model, untouched: Float[Array, "..."]
+) -> tuple[Float[Array, " elements"], Float[Array, "basis basis"], BasisMap]:
+    """Conductivity of an untouched sheet, S, the precision of the logarithm of its pixels, and these pixels."""
+    frame, physics = even_coat("untouched", model, untouched, Pixels(COATING_COLUMNS).on(model))
+    fit = _fitted("untouched", physics, frame, COATING_STD, COATING_LENGTH, COATING_ERROR, TOLERANCE)
+    return *fit, physics.image
+
+
+def even_coat(
+    name: str, model: Model, v0: Float[ArrayLike, "..."], image: BasisMap
+) -> tuple[Float[Array, " readings"], LogConductivity]:
+    """A frame, V, in the model's precision; and the physics of a coat about the even sheet nearest to it.
+
+    Args:
+        name: of the argument that is the frame, for messages.
 
     Raises:
         InverseError: if the frame has another shape, no reading or the opposite sign.
     """
     even = forward(model, model.background)
-    require_frame(v0, even)
-    level = sheet_level(v0, even)
-    return LogConductivity(model, image, level * jnp.average(model.background, weights=model.areas))
+    frame = checked_frame(name, v0, even)
+    return frame, LogConductivity(model, image, sheet_level(name, frame, even) * model.mean_background)
 
 
 def coat_precision(image: BasisMap, length: Float[ArrayLike, ""]) -> AbstractPrecision:
@@ -159,7 +169,7 @@ def sheet_of(
     if sigma is not None and not hasattr(sigma, "shape") and not isinstance(sigma, CoatedSheet):
         raise InverseError(f"sigma is {stated(sigma)}; give the conductivity of each element, S, as an array")
     frame = untouched_frame(model, untouched, sigma, channels)
-    return sigma if frame is None else fit_background(model, frame)
+    return sigma if frame is None else _untouched_sheet(model, frame)[0]
 
 
 def untouched_frame(
@@ -177,73 +187,8 @@ def untouched_frame(
         return None
     if sigma is not None:
         raise InverseError("untouched and sigma both tell the sheet; give one of them")
+    require_real(untouched=untouched)
     frame = jnp.asarray(untouched, model.dtype)
     if channels is not None and frame.shape == np.shape(channels):
         frame = jnp.where(jnp.asarray(channels, bool), frame, jnp.nan)
     return frame
-
-
-def sheet_level(v0: Float[Array, " readings"], even: Float[Array, " readings"]) -> Float[Array, ""]:
-    """Conductivity of the even sheet nearest to a frame, over that of the model; ``even``: the model's readings."""
-    level: Float[Array, ""] = _level(v0, even)
-    if not is_traced(level) and not level > 0:
-        raise InverseError("v0 has the opposite sign of the model's readings; reverse its polarity")
-    return level
-
-
-@verb
-def _level(v0: Float[Array, " readings"], even: Float[Array, " readings"]) -> Float[Array, ""]:
-    there = jnp.isfinite(v0)
-    return jnp.sum(jnp.where(there, even**2, 0)) / (even @ jnp.where(there, v0, 0))
-
-
-@verb
-def frame_error(v0: Float[Array, " readings"], model_error: Float[ArrayLike, ""]) -> Float[Array, " readings"]:
-    """Standard error of each reading of an untouched frame: a part of itself, and a thousandth of their rms."""
-    there = jnp.isfinite(v0)
-    known = jnp.where(there, v0, 0)
-    floor = ERROR_FLOOR * jnp.sqrt(known @ known / jnp.sum(there, dtype=known.dtype))
-    return jnp.hypot(model_error * known, floor)
-
-
-def require_frame(v0: Float[Array, "..."], even: Float[Array, " readings"]) -> None:
-    """Raise InverseError unless v0 is a frame with readings; ``even``: readings of the model."""
-    if v0.shape != even.shape:
-        raise InverseError(f"v0 has shape {v0.shape}; give the {len(even)} readings of one frame")
-    if not is_traced(v0) and not np.any(np.nan_to_num(v0, posinf=0, neginf=0)):
-        raise InverseError("v0 has no reading that is finite and not zero")
-
-
-def require_positive(**values: Any) -> None:
-    """Raise InverseError, with the name of the value, unless every value that is known is above zero."""
-    for name, value in values.items():
-        if not is_traced(value) and not 0 < value < np.inf:
-            raise InverseError(f"{name} is {value}; give a number above zero")
-
-
-@verb
-def _unexplained(
-    found: Float[Array, " readings"], known: Float[Array, " readings"], there: Bool[Array, " readings"]
-) -> Float[Array, ""]:
-    left: Array = jnp.linalg.norm(jnp.where(there, found - known, 0)) / jnp.linalg.norm(known)
-    return left
-
-
-def require_explained(
-    what: str,
-    found: Float[Array, " readings"],
-    known: Float[Array, " readings"],
-    there: Bool[Array, " readings"],
-    hint: Callable[[], str] = str,
-) -> None:
-    """Raise InverseError if too much of a frame is left by the readings that were found for it.
-
-    Args:
-        hint: what ends the message, asked for where there is one.
-    """
-    left: Array = _unexplained(found, known, there)
-    if not is_traced(left) and not left < MAX_UNEXPLAINED:
-        raise InverseError(
-            f"no {what} explains v0: {left:.0%} of it is left; give a frame of this skin, readings in the order of "
-            f"the skin's protocol{hint()}"
-        )

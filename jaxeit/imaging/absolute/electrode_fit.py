@@ -33,9 +33,10 @@ from ...model.motion import Motion, electrode_motion, field_shift_jacobian, move
 from ...model.sensitivity import field_jacobian, field_slope, scaled_jacobian
 from ...registry import AbstractChoice, limited
 from ...registry.limits import LONGEST
-from ..noise import InverseError, require_real
+from ..noise import InverseError
 from ..priors import GaussianSmooth
-from .background import COATING_LENGTH, COATING_STD, frame_error, require_frame, sheet_level
+from .background import COATING_LENGTH, COATING_STD
+from .frames import checked_frame, frame_error, sheet_level
 from .images import AbstractPosterior, most_probable, reading_weights
 
 STRENGTH_STD = 1.0  # of the logarithm of a press's strength, whose first value comes from its readings
@@ -139,10 +140,9 @@ def fit_electrodes(
     require_known("fit_electrodes", InverseError, model.nodes, v0)
     settings = ElectrodeFitSettings() if settings is None else settings
     motion, image = electrode_motion(model), Pixels(settings.columns).on(model)
-    require_real(v0=v0)
-    frame, even = jnp.asarray(v0, model.dtype), forward(model)
-    require_frame(frame, even)
-    level = sheet_level(frame, even) * jnp.average(model.background, weights=model.areas)
+    even = forward(model)
+    frame = checked_frame("v0", v0, even)
+    level = sheet_level("v0", frame, even) * model.mean_background
     seen = _no_presses(model) if presses is None else _checked(model, presses)
     weight, known = reading_weights(
         jnp.concatenate([frame[None], seen.change]),

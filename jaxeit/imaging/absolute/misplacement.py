@@ -28,7 +28,7 @@ from ...model.discretisation import Model
 from ...model.forward_model import Coefficients, Fields, terminal_matrix, voltages
 from ...model.motion import Motion, electrode_motion, field_shift_jacobian
 from ...model.sensitivity import field_jacobian, solved_fields
-from ..noise import InverseError, real_numbers, require_real
+from ..noise import InverseError, real_numbers
 from .background import (
     COATING_COLUMNS,
     COATING_ERROR,
@@ -36,8 +36,8 @@ from .background import (
     COATING_STD,
     coat_precision,
     even_coat,
-    frame_error,
 )
+from .frames import frame_error
 from .images import LogConductivity, Quadratic, gauss_newton
 
 COAT_SPREAD = 0.7  # of the logarithm of the deviation of the coat
@@ -91,9 +91,7 @@ def find_misplacement(
         print(f"bolts sit {1e3 * doubt.size:.1f} mm aside; log evidence {0.5 * doubt.evidence:.0f}")
     """
     require_known("find_misplacement", InverseError, model.nodes, v0, noise)
-    require_real(v0=v0)
-    frame = jnp.asarray(v0, model.dtype)
-    physics = even_coat(model, frame, Pixels(COATING_COLUMNS).on(model))
+    frame, physics = even_coat("v0", model, v0, Pixels(COATING_COLUMNS).on(model))
     penalty = Quadratic(coat_precision(physics.image, COATING_LENGTH), 1 / jnp.asarray(COATING_STD) ** 2)
     coat = gauss_newton(physics, penalty, frame, frame_error(frame, COATING_ERROR))
     linear = _linear(physics, electrode_motion(model), coat, *solved_fields(model, physics.sigma(coat)))

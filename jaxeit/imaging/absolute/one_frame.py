@@ -11,8 +11,8 @@ from ..._compile import require_known
 from ...model.bases import AbstractBasis, BasisMap, Picture, Pixels
 from ...model.discretisation import Model, require_model
 from ...model.forward_model import forward
-from ..noise import InverseError, require_real
-from .background import frame_error, require_frame, require_positive, sheet_level
+from ..noise import InverseError
+from .frames import checked_frame, frame_error, require_positive, sheet_level
 from .images import AbstractPenalty, IsotropicVariation, LogConductivity, gauss_newton
 
 WEIGHT = 0.0064
@@ -75,12 +75,11 @@ def absolute_image(
     """
     require_model(model)
     require_known("absolute_image", InverseError, model.background)
-    require_real(frame=frame)
     require_positive(error=error)
-    readings, even = jnp.asarray(frame, model.dtype), forward(model)
-    require_frame(readings, even)
+    even = forward(model)
+    readings = checked_frame("frame", frame, even)
     image = picture_basis(model, basis)
-    level = sheet_level(readings, even) * jnp.average(model.background, weights=model.areas)
+    level = sheet_level("frame", readings, even) * model.mean_background
     physics, own = LogConductivity(model, image, level), frame_error(readings, error)
     used = jnp.sum(jnp.isfinite(readings), dtype=model.dtype)
     penalty = variation_of(used) if penalty is None else penalty

@@ -29,8 +29,8 @@ from ...linalg.lapack import eigh
 from ...model.discretisation import Model, require_model
 from ...model.forward_model import forward
 from ...model.motion import Motion, electrode_motion, moved
-from ..noise import ConvergenceError, InverseError, require_real
-from .background import MAX_UNEXPLAINED, frame_error, require_explained, require_frame, sheet_level
+from ..noise import ConvergenceError, InverseError
+from .frames import MAX_UNEXPLAINED, checked_errors, checked_frame, frame_error, require_explained, sheet_level
 from .images import reading_weights
 
 MODEL_ERROR = 3e-3
@@ -180,12 +180,10 @@ def fit_reference(
     """
     require_model(model)
     settings = ReferenceSettings() if settings is None else settings
-    require_real(frame=frame)
-    readings, even = jnp.asarray(frame, model.dtype), forward(model)
-    require_frame(readings, even)
-    level = sheet_level(readings, even) if settings.level else jnp.ones((), model.dtype)
-    error = frame_error(readings, MODEL_ERROR) if std is None else jnp.asarray(std, model.dtype)
-    require_frame(error, even)
+    even = forward(model)
+    readings = checked_frame("frame", frame, even)
+    level = sheet_level("frame", readings, even) if settings.level else jnp.ones((), model.dtype)
+    error = frame_error(readings, MODEL_ERROR) if std is None else checked_errors("std", std, even)
     weight, known = reading_weights(readings, error)
     each = _channels(model, channel) if settings.gain or settings.offset else None
     channels = 0 if each is None else int(each.max()) + 1
@@ -199,7 +197,7 @@ def fit_reference(
     fit, found = _described(problem, known, used, jnp.where(converged, x, jnp.nan))
     used = jnp.where(converged, used, 0)
     hint: Callable[[], str] = str if settings.offset else partial(_with_offset, known, even, used)
-    require_explained("even content", found, known, used > 0, hint)
+    require_explained("frame", "even content", found, known, used > 0, hint)
     return fit
 
 
