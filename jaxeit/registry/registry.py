@@ -11,14 +11,14 @@ import importlib
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING
 from importlib.metadata import EntryPoint, entry_points
 from inspect import isabstract, isclass
 from typing import Any, Generic, TypeVar, cast
 
 from ..spelling import did_you_mean
 from ..toml import TomlError, TomlTable, parse_values
-from .settings import Part, settings_of, word
+from .settings import Part, fields_of, settings_of, word
 
 T = TypeVar("T")
 
@@ -160,6 +160,10 @@ class Registry(Mapping[str, type[T]], Generic[T]):
                 f": it lacks {lacks}" if lacks else ""
             )
             raise RegistryError(f"{self.kind} {name!r} {what}")
+        try:
+            fields_of(thing)
+        except ValueError as error:
+            raise RegistryError(f"{self.kind} {name!r}: {error}") from None
         checked: type[T] = thing
         return checked
 
@@ -239,7 +243,7 @@ def _with_type(error: BaseException) -> str:
 def _made(kind: type[T], table: TomlTable, given: Mapping[str, Any], parts: tuple[Part, ...]) -> T:
     """An object of this class with the settings of the table; refuses all other keys."""
     known = settings_of(kind, parts)
-    own = fields(cast(Any, kind))
+    own = fields_of(kind)
     required = {f.name for f in own if f.default is MISSING and f.default_factory is MISSING}
     for missing in required - set(known) - set(given):
         raise table.error(missing, f"text cannot give this field of {kind.__name__}; make the object in Python")

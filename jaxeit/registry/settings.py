@@ -4,8 +4,8 @@ import enum
 import math
 import re
 from collections.abc import Callable
-from dataclasses import MISSING, Field, dataclass, fields
-from inspect import cleandoc, isclass
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from inspect import cleandoc, isclass, signature
 from types import UnionType
 from typing import Any, NamedTuple, Protocol, Union, get_args, get_origin, get_type_hints, runtime_checkable
 
@@ -184,7 +184,7 @@ def settings_of(kind: type, parts: tuple[Part, ...]) -> dict[str, Setting]:
     """The settings of a class, by name."""
     hints, described = get_type_hints(kind), _descriptions(kind)
     out = {}
-    for field in fields(kind):
+    for field in fields_of(kind):
         if not field.init or field.metadata.get("computed"):
             continue
         default, hint = _default(field), hints[field.name]
@@ -194,6 +194,21 @@ def settings_of(kind: type, parts: tuple[Part, ...]) -> dict[str, Setting]:
         if forms or part is not None:
             out[field.name] = Setting(field.name, forms, default, described.get(field.name, ""), part)
     return out
+
+
+def fields_of(kind: type) -> tuple["Field[Any]", ...]:
+    """The fields of a dataclass; none for a plain class, which may then take no arguments.
+
+    Raises:
+        ValueError: for a plain class that takes arguments, since nothing says which of them its objects were made with.
+    """
+    if is_dataclass(kind):
+        return fields(kind)
+    if signature(kind).parameters:
+        raise ValueError(
+            f"{kind.__name__} takes arguments and has no fields, which files keep; write it as a dataclass"
+        )
+    return ()
 
 
 def _holds(hint: Any, base: type) -> bool:
@@ -218,7 +233,7 @@ def _descriptions(kind: type) -> dict[str, str]:
     rows = [_cells(line) for line in cleandoc(kind.__doc__ or "").splitlines() if line.startswith("|")]
     if len(rows) < 2:
         return {}
-    head, names = rows[0], {field.name for field in fields(kind)}
+    head, names = rows[0], {field.name for field in fields_of(kind)}
     out = {}
     for row in rows[2:]:
         said = dict(zip(head, row, strict=False))

@@ -218,3 +218,27 @@ def test_a_field(own):
     field = FIELDS.make(f"{own}:Slope", allow_import=True)
     assert FIELDS.text(field) == f"{own}:Slope"
     assert field.size(4) == 1
+
+
+class Halved(calib.presses.AbstractCorrection):
+    """A plain class without arguments."""
+
+    def apply(self, time, values, name):
+        return values / 2
+
+
+class Scaled(Halved):
+    """A plain class whose argument no file would keep."""
+
+    def __init__(self, factor=3.0):
+        self.factor = factor
+
+
+def test_a_plain_class_is_a_choice_unless_it_takes_arguments():
+    corrections = calib.presses.CORRECTIONS
+    path = f"{__name__}:Halved"
+    assert corrections.text(corrections.make(path)) == path
+    with pytest.raises(ValueError, match=r"Scaled takes arguments and has no fields, .* write it as a dataclass"):
+        corrections.make(f"{__name__}:Scaled")
+    with pytest.raises(ValueError, match="write it as a dataclass"):
+        corrections.settings(Scaled(2.0))
