@@ -43,6 +43,7 @@ AUTO = "auto"
 AUTO_CURVES = ("linear", "power", "polynomial", "spline")
 """Curves that ``auto`` stands for: zero at zero pressure, so that idle pads add nothing, and without memory."""
 NONE = "none"
+DEFAULT = "default"  # corrections: a low-pass where a stream holds something to remove
 LEVELS: Mapping[str, Callable[..., je.Fidelity]] = {
     "draft": je.Fidelity.draft,
     "standard": je.Fidelity.standard,
@@ -180,9 +181,9 @@ def read_processing(table: TomlTable, base: Processing) -> Processing:
 
 
 def _corrections(table: TomlTable) -> tuple[Any, ...] | None:
-    """The corrections in order; None for ``"default"``: a low-pass where it has something to remove."""
-    value = table.get("corrections", lambda v: v == "default" or isinstance(v, list), 'a list, or "default"')
-    if value == "default":
+    """The corrections in order; None for `DEFAULT`."""
+    value = table.get("corrections", lambda v: v == DEFAULT or isinstance(v, list), f'a list, or "{DEFAULT}"')
+    if value == DEFAULT:
         return None
     rows = [TomlTable({"corrections": one}, table.where, table.allow_import) for one in value]
     return tuple(_choice(row, "corrections", CORRECTIONS) for row in rows)
@@ -244,7 +245,7 @@ def recipe_to_toml(recipe: "Recipe") -> str:
         "noise": je.imaging.NOISES.settings(imaging.noise),
     }
     cuts = {
-        "corrections": "default" if corrections is None else [CORRECTIONS.settings(c) for c in corrections],
+        "corrections": DEFAULT if corrections is None else [CORRECTIONS.settings(c) for c in corrections],
         "baseline": BASELINES.settings(processing.baseline),
         "windows": {f.name: getattr(processing.windows, f.name) for f in fields(WindowLengths)},
     }

@@ -15,6 +15,7 @@ from ..calibration import Recipe
 from ..calibration.localisation.locators import LOCATORS
 from ..calibration.recipe_text import (
     AUTO,
+    DEFAULT,
     LEVELS,
     NONE,
     SWITCHES,
@@ -24,7 +25,7 @@ from ..calibration.recipe_text import (
     location_choice,
 )
 from ..fitting import CURVES, FIELDS, LOSSES
-from ..presses.corrections import BASELINES, LowPass
+from ..presses.corrections import BASELINES, CORRECTIONS, AbstractCorrection, LowPass
 from ..presses.table import Processing
 from .arguments import above_zero, count
 
@@ -56,22 +57,29 @@ def add_recipe_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--folds", type=count, metavar="K", help=text + "one place is left out at a time; default: 5")
     _choice(group, "--fidelity", LEVELS, "accuracy of the finite-element model", default="standard")
     text = "assume that the sheet is even; default: its conductivity is fitted to the untouched frames"
-    group.add_argument("--even-sheet", action="store_true", help=text)
+    _switch(group, "--even-sheet", text)
     text = (
         "move the electrodes to the places that untouched frames and presses show; the places of presses must be right"
     )
-    group.add_argument("--fit-electrodes", action="store_true", help=text)
+    _switch(group, "--fit-electrodes", text)
     text = "learn the gain of the contact layer from the presses; it improves apply `--loads`, `--track`"
-    group.add_argument("--learn-layer", action="store_true", help=text)
+    _switch(group, "--learn-layer", text)
     _choice(group, "--baseline", BASELINES, "baseline that is subtracted from a press", default="two-sided")
-    add_low_pass_argument(group)
+    add_correction_arguments(group)
     add_imaging_arguments(parser)
 
 
-def add_low_pass_argument(parser: Any) -> None:
-    """The option of the low-pass filter."""
-    text = "cutoff of the low-pass filter; default: 50, or no filter for streams of 100 Hz or slower"
+def add_correction_arguments(parser: Any, default: str = "a low-pass of 50 Hz on streams above 100 Hz") -> None:
+    """The options of what is applied to every stream."""
+    text = "correction of every stream; repeat the option for several, in order"
+    _choice(parser, "--correction", (NONE, DEFAULT, *CORRECTIONS), text, default, action="append")
+    text = "cutoff of the low-pass filter; other corrections stay"
     parser.add_argument("--low-pass", type=above_zero, metavar="HZ", help=text)
+
+
+def _switch(parser: Any, option: str, text: str) -> None:
+    """An option that is on, off with a ``no-`` before its name, or as in the recipe file where it is not given."""
+    parser.add_argument(option, action=argparse.BooleanOptionalAction, default=None, help=text)
 
 
 def add_imaging_arguments(parser: argparse.ArgumentParser) -> None:
@@ -90,12 +98,12 @@ def add_imaging_arguments(parser: argparse.ArgumentParser) -> None:
     _choice(group, "--noise", imaging.NOISES, text, default="equal")
 
 
-def _choice(parser: Any, option: str, names: Iterable[str], text: str, default: str) -> None:
+def _choice(parser: Any, option: str, names: Iterable[str], text: str, default: str, action: str = "store") -> None:
     names = tuple(names)
     text = f"{text} (default: {default}); one of {', '.join(names)}"
-    action = parser.add_argument(option, metavar="NAME", help=text)
+    added = parser.add_argument(option, metavar="NAME", help=text, action=action)
     # A choice may have settings, so that these are not all of its texts; a shell completes them.
-    action.suggestions = tuple(name for name in names if " " not in name)
+    added.suggestions = tuple(name for name in names if " " not in name)
 
 
 def recipe_of(args: argparse.Namespace) -> Recipe:
@@ -114,7 +122,7 @@ def recipe_of(args: argparse.Namespace) -> Recipe:
     }
     given = {name: _made(args, name, of) for name, of in make.items() if getattr(args, name) is not None}
     given |= {} if args.folds is None else {"folds": args.folds}
-    given |= {name: True for name in SWITCHES if getattr(args, name)}
+    given |= {name: getattr(args, name) for name in SWITCHES if getattr(args, name) is not None}
     processing = processing_of(args, recipe.processing)
     recipe = replace(recipe, **given, processing=processing, imaging=imaging_of(args, recipe.imaging))
     if args.locator is not None and not recipe.locates:
@@ -145,17 +153,43 @@ def processing_of(args: argparse.Namespace, base: Processing) -> Processing:
     """The processing that the options make, with the rest as in ``base``."""
     if getattr(args, "baseline", None) is not None:
         base = replace(base, baseline=_made(args, "baseline", BASELINES.make))
-    return base if args.low_pass is None else replace(base, corrections=(LowPass(args.low_pass),))
+    return replace(base, corrections=_corrections(args, base.corrections))
 
 
-def refuse_low_pass(args: argparse.Namespace) -> None:
-    """Refuse a filter for the calibration of a log, which is made and used without one."""
-    if args.low_pass is not None:
-        raise ValueError("--low-pass: for calibrations with EIT, and this one is of a log; leave it out")
+def _corrections(
+    args: argparse.Namespace, base: tuple[AbstractCorrection, ...] | None
+) -> tuple[AbstractCorrection, ...] | None:
+    """The corrections of the options, or those of ``base``, with the low-pass that the options give."""
+    named = args.correction or []
+    alone = next((one for one in named if one in (NONE, DEFAULT)), None)
+    if alone is not None and len(named) > 1:
+        raise ValueError(f"--correction {alone} stands alone; leave it out, or the others")
+    if alone is not None:
+        base = None if alone == DEFAULT else ()
+    elif named:
+        base = tuple(_of_option("correction", one, CORRECTIONS.make) for one in named)
+    if args.low_pass is None:
+        return base
+    kept = base or ()
+    if not any(isinstance(one, LowPass) for one in kept):
+        return LowPass(args.low_pass), *kept
+    return tuple(replace(one, cutoff=args.low_pass) if isinstance(one, LowPass) else one for one in kept)
+
+
+def refuse_corrections(args: argparse.Namespace) -> None:
+    """Refuse corrections for the calibration of a log, which is made and used without them."""
+    given = [option for option in ("correction", "low_pass") if getattr(args, option) is not None]
+    if given:
+        option = "--" + given[0].replace("_", "-")
+        raise ValueError(f"{option}: for calibrations with EIT, and this one is of a log; leave it out")
 
 
 def _made(args: argparse.Namespace, name: str, make: Callable[[str, bool], T]) -> T:
+    return _of_option(name, getattr(args, name), make)
+
+
+def _of_option(name: str, text: str, make: Callable[[str, bool], T]) -> T:
     try:
-        return make(getattr(args, name), True)
+        return make(text, True)
     except ValueError as error:
         raise ValueError(f"--{name}: {error}") from None

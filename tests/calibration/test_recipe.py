@@ -2,6 +2,7 @@
 
 import argparse
 from dataclasses import replace
+from operator import attrgetter
 
 import jax.numpy as jnp
 import numpy as np
@@ -129,6 +130,48 @@ def options(*words):
     parser = argparse.ArgumentParser()
     add_recipe_arguments(parser)
     return recipe_of(parser.parse_args(words))
+
+
+class Doubled(calib.presses.AbstractCorrection):
+    """A correction that a user wrote."""
+
+    def apply(self, time, values, name):
+        return 2 * values
+
+
+def test_a_low_pass_on_the_command_line_leaves_other_corrections():
+    doubled = f"{__name__}:Doubled"
+    own, soft = options("--correction", doubled), options("--correction", "low-pass:order=4")
+    assert [type(one).__name__ for one in own.processing.corrections] == ["Doubled"]
+    both = options("--correction", doubled, "--correction", "low-pass:order=4", "--low-pass", "9").processing
+    assert isinstance(both.corrections[0], Doubled)
+    assert both.corrections[1:] == (replace(soft.processing.corrections[0], cutoff=9.0),)
+    added = options("--correction", doubled, "--low-pass", "9").processing.corrections
+    assert added[0] == calib.presses.LowPass(9.0)
+    assert isinstance(added[1], Doubled)
+
+
+def test_corrections_of_a_file_are_switched_off_or_replaced(tmp_path):
+    path = tmp_path / "r.toml"
+    path.write_text('[processing]\ncorrections = ["low-pass:cutoff=20,order=3"]\n')
+    file = ("--recipe", str(path))
+    assert options(*file, "--correction", "none").processing.corrections == ()
+    assert options(*file, "--correction", "default").processing.corrections is None
+    assert options(*file, "--low-pass", "9").processing.corrections == (calib.presses.LowPass(9.0, order=3),)
+    with pytest.raises(ValueError, match="--correction none stands alone"):
+        options("--correction", "low-pass", "--correction", "none")
+    with pytest.raises(ValueError, match="--correction: no correction 'high-pass'"):
+        options("--correction", "high-pass")
+
+
+@pytest.mark.parametrize("name", ["even-sheet", "fit-electrodes", "learn-layer"])
+def test_an_option_switches_off_what_the_file_switches_on(tmp_path, name):
+    path = tmp_path / "r.toml"
+    path.write_text(f"{name.replace('-', '_')} = true\n")
+    file = ("--recipe", str(path))
+    asked = attrgetter(name.replace("-", "_"))
+    assert asked(options(*file))
+    assert not asked(options(*file, f"--no-{name}"))
 
 
 @pytest.mark.parametrize("name", [*CURVES, *(f"{f} --location" for f in FIELDS)])

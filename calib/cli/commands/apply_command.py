@@ -11,7 +11,7 @@ from ..arguments import (
     proposal_of,
     require_matplotlib_for,
 )
-from ..recipe_options import add_low_pass_argument, processing_of, refuse_low_pass
+from ..recipe_options import add_correction_arguments, processing_of, refuse_corrections
 from ..terminal import progress_bar, show
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "write an HTML report: paths and forces of the contacts that are followed (--track), probabilities of --loads"
     )
     parser.add_argument("--report", metavar="REPORT.html", help=text)
-    add_low_pass_argument(parser)
+    add_correction_arguments(parser, default="as for the calibration")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -96,7 +96,7 @@ def _run_log(args: argparse.Namespace, calibration: "LogCalibration") -> int:
     from ...calibration import apply_log
     from ...session import open_session
 
-    refuse_low_pass(args)
+    refuse_corrections(args)
     if args.loads is not None or args.track:
         option = "--track" if args.track else "--loads"
         raise ValueError(f"{option}: the calibration of a log has no EIT, which tells where contacts are")

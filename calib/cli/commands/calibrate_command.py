@@ -160,7 +160,7 @@ def _refuse_single(args: argparse.Namespace) -> None:
         raise ValueError(f"--report {args.report}: every session gets a page of its own; give --report without a name")
 
 
-_NEED_EIT = ("skin", "locator", "folds", "fidelity", "baseline", "low_pass", *SWITCHES, *IMAGING)
+_NEED_EIT = ("skin", "locator", "folds", "fidelity", "baseline", "correction", "low_pass", *SWITCHES, *IMAGING)
 
 
 def _calibrate_logs(args: argparse.Namespace, recipe: Recipe, sessions: Sequence[Session]) -> int:

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..recipe_options import add_low_pass_argument, processing_of, refuse_low_pass
+from ..recipe_options import add_correction_arguments, processing_of, refuse_corrections
 from ..terminal import progress_bar, show, title
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """A calibration and the sessions on which it is evaluated."""
     parser.add_argument("calibration", metavar="CALIBRATION.h5")
     parser.add_argument("sessions", nargs="+", metavar="SESSION.h5")
-    add_low_pass_argument(parser)
+    add_correction_arguments(parser, default="as for the calibration")
     text = "continue despite errors that `jaxeit check` finds; the results name them"
     parser.add_argument("--force", action="store_true", help=text)
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
@@ -54,7 +54,7 @@ def _evaluate_logs(args: argparse.Namespace, calibration: "LogCalibration") -> i
     from ...calibration.logs.procedure import evaluate_log
     from ...session import open_session
 
-    refuse_low_pass(args)
+    refuse_corrections(args)
     results = {}
     for path in progress_bar("sessions")(args.sessions):
         with open_session(path) as session:

@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 COLOURS = ("#ffffff", "#2166ac", "#b2182b")
 """Of the classes: as the reference, resistive, conductive."""
 
+UNFINISHED = (
+    "the fit of the image has not converged: its steps ended first, and the image may be wrong; check the tank's model"
+)
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """A file of a tank, its geometry where the file has none, and the picture to write."""
@@ -138,7 +142,8 @@ def _conductivity(args: argparse.Namespace, tank: "Tank", axes: "Axes") -> list[
     je.plot.show_image(found.shown.picture, found.shown.image, axes, label="conductivity, S")
     fitted = [] if found.fit is None else [f"fitted to the reference: {_fitted(found.fit)}"]
     low, high = float(found.shown.sigma.min()), float(found.shown.sigma.max())
-    return [*fitted, f"{args.output}: conductivity {low:.3g} to {high:.3g} S"]
+    unfinished = [] if found.shown.converged else [UNFINISHED]
+    return [*fitted, *unfinished, f"{args.output}: conductivity {low:.3g} to {high:.3g} S"]
 
 
 def _classes(args: argparse.Namespace, tank: "Tank", axes: "Axes") -> list[str]:
@@ -153,7 +158,8 @@ def _classes(args: argparse.Namespace, tank: "Tank", axes: "Axes") -> list[str]:
     axes.imshow(found.classes, ListedColormap(COLOURS), origin="lower", extent=(x0, x1, y0, y1), vmin=0, vmax=2)
     shares = np.bincount(found.classes.ravel(), minlength=3) / found.classes.size
     areas = 1e-2 * (x1 - x0) * (y1 - y0) * shares
-    return [f"{args.output}: {areas[1]:.3g} cm^2 resistive (blue), {areas[2]:.3g} cm^2 conductive (red)"]
+    unfinished = [] if found.converged else [UNFINISHED]
+    return [*unfinished, f"{args.output}: {areas[1]:.3g} cm^2 resistive (blue), {areas[2]:.3g} cm^2 conductive (red)"]
 
 
 def _fit(args: argparse.Namespace) -> "ReferenceSettings | None":
