@@ -46,6 +46,11 @@ def check_electrodes(
         )
         findings.append(Finding(Severity.WARNING, WHERE, what, OTHER_CAUSE))
         return ()
+    if not fit.converged:
+        what = (
+            "the fit of the places of electrodes has not converged: shifts may err by more than their standard errors"
+        )
+        findings.append(Finding(Severity.OK, WHERE, what))
     rows = _rows(fit)
     findings += _findings(rows)
     return rows

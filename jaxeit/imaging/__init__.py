@@ -45,10 +45,12 @@ from .absolute.background import fit_background
 from .absolute.electrode_fit import ElectrodeFit, ElectrodeFitSettings, KnownPresses, fit_electrodes
 from .absolute.images import (
     AbstractPenalty,
+    ImageFit,
     IsotropicVariation,
     LogConductivity,
     Quadratic,
     gauss_newton,
+    gauss_newton_fit,
     least_squares_image,
 )
 from .absolute.misplacement import Misplacement, find_misplacement
@@ -139,6 +141,7 @@ __all__ = [
     "GeneralisedCrossValidation",
     "Greit",
     "HyperparameterError",
+    "ImageFit",
     "Imaging",
     "InverseError",
     "IsotropicVariation",
@@ -178,6 +181,7 @@ __all__ = [
     "fit_reference",
     "from_numbers",
     "gauss_newton",
+    "gauss_newton_fit",
     "half_height_classes",
     "least_squares_image",
     "load_reconstructor",

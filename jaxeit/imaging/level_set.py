@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 
 from .._compile import verb
@@ -19,12 +19,10 @@ from ..least_squares import quadratic
 from ..least_squares.searches import HalfSquares
 from ..model.bases import Picture
 from .absolute.frames import require_positive
-from .absolute.images import AbstractPosterior, ImagePosterior, Quadratic, most_probable
+from .absolute.images import IMAGE_STEPS, IMAGE_TOLERANCE, AbstractPosterior, ImagePosterior, Quadratic, most_probable
 from .noise import InverseError
 from .priors import AbstractPrior, Laplace
 
-STEPS, TOLERANCE = 12, 2e-3
-"""Of the fit at each width."""
 FAR = 4.0
 """Largest distance from a border that the first level tells, pixels of the image."""
 
@@ -71,12 +69,13 @@ def signed_distances(classes: Int[np.ndarray, "rows columns"], picture: Picture)
 
 class FittedLevel(NamedTuple):
     """The most probable level of each pixel and the image of pieces that it makes, (basis,); misfit and objective as
-    `Segmentation` has them."""
+    `Segmentation` has them; whether the fit at the last width converged."""
 
     level: Float[Array, " basis"]
     pieces: Float[Array, " basis"]
     misfit: Float[Array, ""]
     objective: Float[Array, ""]
+    converged: Bool[Array, ""]
 
 
 def fitted_level(
@@ -102,11 +101,12 @@ def fitted_level(
     prior, std = Quadratic(smooth, settings.weight * readings), jnp.asarray(settings.height_std, dtype)
     for width in settings.widths:
         shaped = _LevelPosterior(posterior, prior, expected, std, jnp.asarray(owner), jnp.asarray(width, dtype))
-        z, _ = most_probable(shaped, z, STEPS, TOLERANCE, damped=True)
+        z, state = most_probable(shaped, z, IMAGE_STEPS, IMAGE_TOLERANCE, damped=True)
     left = _residual(shaped, z)
     data = jnp.sum(left[: len(posterior.readings)] ** 2)
     # the penalty and the prior are numbers of which half the square has 1/2 too much
-    return FittedLevel(z[: picture.size], shaped.pieces(z), jnp.sqrt(data / readings), 0.5 * jnp.sum(left**2) - 1)
+    misfit, objective = jnp.sqrt(data / readings), 0.5 * jnp.sum(left**2) - 1
+    return FittedLevel(z[: picture.size], shaped.pieces(z), misfit, objective, state.converged)
 
 
 @verb

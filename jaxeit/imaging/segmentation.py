@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, DTypeLike, Float, Int, Shaped
+from jaxtyping import Array, Bool, DTypeLike, Float, Int, Shaped
 from scipy.ndimage import distance_transform_edt, label, map_coordinates
 
 from .._compile import require_known
@@ -87,6 +87,8 @@ class Segmentation(eqx.Module):
     | errors: standard error of each change that was believed, V                           | (readings,)     |
     | misfit: root mean square of what the pieces leave of the changes, over the errors    | ()              |
     | objective: what the fit of borders minimises; the least of several starts is best    | ()              |
+    | converged: whether the fit of the image ended before its twelve steps did            | ()              |
+    | borders_converged: the same of the fit of the borders; False: none were fitted       | ()              |
     """
 
     image: Float[Array, " basis"]
@@ -96,6 +98,8 @@ class Segmentation(eqx.Module):
     errors: Float[Array, " readings"]
     misfit: Float[Array, ""]
     objective: Float[Array, ""]
+    converged: Bool[Array, ""]
+    borders_converged: Bool[Array, ""]
 
 
 ERRORS, REGIONS, BORDERS = ChangeErrors(), RegionSettings(), LevelSet()
@@ -152,12 +156,14 @@ def segment(
     image = picture_basis(model, basis)
     penalty = variation_of(seen.used(model.dtype)) if penalty is None else penalty
     physics = LogConductivity(model, image, model.mean_background)
-    found, std, _ = believed_image(physics, penalty, seen.target, lambda growth: seen.std(errors, growth))
-    grid = on_grid(found, image.picture, (regions.pixels, regions.pixels))
+    found = believed_image(physics, penalty, seen.target, lambda growth: seen.std(errors, growth))
+    grid = on_grid(found.image, image.picture, (regions.pixels, regions.pixels))
     classes = half_height_classes(grid, regions.floor, regions.least, regions.weakest)
     classes = classes if start is None else _checked_start(start, classes.shape)
     unfitted = jnp.asarray(jnp.nan, model.dtype)
-    before = Segmentation(found, image.picture, classes, found * unfitted, std, unfitted, unfitted)
+    pieces, shaped = found.image * unfitted, jnp.asarray(False)
+    fitted = pieces, found.errors, unfitted, unfitted, found.converged, shaped
+    before = Segmentation(found.image, image.picture, classes, *fitted)
     return before if borders is None or not classes.any() else _shaped(physics, penalty, seen, before, borders)
 
 
@@ -219,7 +225,8 @@ def _shaped(
     fit = fitted_level(posterior, start, seen.used(physics.model.dtype), borders)
     inside = on_grid(fit.level, before.picture, before.classes.shape) > 0
     classes = np.where(inside, start.owner + 1, UNCHANGED)
-    return replace(before, classes=classes, pieces=fit.pieces, misfit=fit.misfit, objective=fit.objective)
+    told = replace(before, misfit=fit.misfit, objective=fit.objective, borders_converged=fit.converged)
+    return replace(told, classes=classes, pieces=fit.pieces)
 
 
 def on_grid(

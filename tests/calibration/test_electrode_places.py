@@ -28,7 +28,7 @@ def _fit(shift, misfit):
 
     def fit(model, v0, presses):
         given.append((v0, presses))
-        return ElectrodeFit(shift, jnp.eye(50) * 1e-8, model.background, jnp.asarray(misfit))
+        return ElectrodeFit(shift, jnp.eye(50) * 1e-8, model.background, jnp.asarray(misfit), jnp.asarray(True))
 
     return fit, given
 

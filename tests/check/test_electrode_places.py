@@ -84,7 +84,9 @@ def test_what_cannot_be_checked_is_said(skin, monkeypatch):
         rows, (finding,) = _found(*given)
         assert (rows, finding.severity) == ((), Severity.OK)
         assert f"not checked: {said}" in finding.what or said in finding.what
-    fit = je.imaging.ElectrodeFit(jnp.zeros((25, 2)), 1e-8 * jnp.eye(50), jnp.ones(1), jnp.asarray(7.0))
+    fit = je.imaging.ElectrodeFit(
+        jnp.zeros((25, 2)), 1e-8 * jnp.eye(50), jnp.ones(1), jnp.asarray(7.0), jnp.asarray(True)
+    )
     monkeypatch.setattr(calib.check.electrodes, "fit_electrodes", lambda *_: fit)
     rows, (finding,) = _found(skin, table)
     assert (rows, finding.severity) == ((), Severity.WARNING)
@@ -101,7 +103,7 @@ def test_shifts_are_told_that_are_significant_and_not_small(skin, monkeypatch):
     error = np.full((25, 2), 2e-4)
     error[5], error[6] = 5e-5, 5e-4
     fit = je.imaging.ElectrodeFit(
-        jnp.asarray(shift), jnp.diag(jnp.asarray(error.ravel() ** 2)), jnp.ones(1), jnp.asarray(0.1)
+        jnp.asarray(shift), jnp.diag(jnp.asarray(error.ravel() ** 2)), jnp.ones(1), jnp.asarray(0.1), jnp.asarray(True)
     )
     monkeypatch.setattr(calib.check.electrodes, "fit_electrodes", lambda *_: fit)
     rows, (finding,) = _found(skin, _table(skin))
@@ -109,3 +111,14 @@ def test_shifts_are_told_that_are_significant_and_not_small(skin, monkeypatch):
     assert rows[3].significance == pytest.approx(10)
     said = "no. 3 by 2.0 +- 0.2 mm (x +2.0, y +0.0), no. 4 by 1.0 +- 0.2 mm (x +0.0, y -1.0)"
     assert finding.what == f"2 of 25 electrodes seem to sit elsewhere than the skin's file says: {said}"
+
+
+def test_a_fit_that_its_steps_ended_is_said(skin, monkeypatch):
+    fit = je.imaging.ElectrodeFit(
+        jnp.zeros((25, 2)), 1e-8 * jnp.eye(50), jnp.ones(1), jnp.asarray(0.1), jnp.asarray(False)
+    )
+    monkeypatch.setattr(calib.check.electrodes, "fit_electrodes", lambda *_: fit)
+    rows, (first, finding) = _found(skin, _table(skin))
+    assert len(rows) == 25
+    assert first.severity == finding.severity == Severity.OK
+    assert "has not converged: shifts may err by more than their standard errors" in first.what

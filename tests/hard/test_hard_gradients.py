@@ -468,6 +468,7 @@ ELSEWHERE = {
     "ContactFinder": "below, and in tests/contacts/test_contacts.py",
     "fit_background": "in tests/imaging/test_background.py",
     "gauss_newton": "in tests/imaging/test_nonlinear.py",
+    "gauss_newton_fit": "gauss_newton, whose image it is",
     "least_squares_image": "in tests/imaging/test_nonlinear.py",
 }
 

@@ -66,6 +66,7 @@ def test_electrodes_are_found(skin, nominal, pressed, largest):
         errors.append(error)
         pulls.append(error / np.asarray(fit.standard_error))
         assert 0 < float(fit.misfit) < 1
+        assert fit.converged
     inner = np.abs(skin.electrode_positions - 0.1).max(1) < 0.05
     for found, limit in zip((np.array(errors), np.array(errors)[:, inner]), largest, strict=True):
         assert np.sqrt(np.mean(np.square(found))) < limit

@@ -1,5 +1,7 @@
 """Gauss-Newton through the full forward map."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
+from jaxeit.imaging.absolute import one_frame
 
 from ..helpers import skin_of, spread_stacks, square_model
 
@@ -213,3 +216,66 @@ def test_an_image_that_did_not_converge_is_not_given(tiny):
     readings = tiny.voltages(0.8 * jnp.cos(jnp.arange(16.0)))
     found = je.imaging.least_squares_image(tiny, _tiny_penalty(tiny), readings, jnp.full(len(readings), 1e-6), steps=1)
     assert np.isnan(found).all()
+
+
+def test_an_image_after_its_last_step_says_so(tiny):
+    """The image itself is that of `gauss_newton`: the best of the steps that were allowed."""
+    readings = tiny.voltages(0.8 * jnp.cos(jnp.arange(16.0)))
+    given = tiny, _tiny_penalty(tiny), readings, jnp.full(len(readings), 1e-3 * float(jnp.std(readings)))
+    short, whole = (je.imaging.gauss_newton_fit(*given, steps=steps) for steps in (1, 30))
+    assert (bool(short.converged), bool(whole.converged)) == (False, True)
+    np.testing.assert_array_equal(je.gauss_newton(*given, steps=1), short.image)
+    assert np.isfinite(short.image).all()
+    assert np.abs(short.image - whole.image).max() > 1e-3
+
+
+@pytest.mark.parametrize("fit", [je.gauss_newton, je.imaging.least_squares_image])
+def test_errors_of_zero_are_refused_or_leave_a_reading_out(tiny, fit):
+    """A weight without end made the image zero throughout."""
+    readings, penalty = tiny.voltages(0.8 * jnp.cos(jnp.arange(16.0))), _tiny_penalty(tiny)
+    std = jnp.full(len(readings), 1e-2 * float(jnp.std(readings)))
+    for bad in (0.0, -1.0):
+        with pytest.raises(
+            je.imaging.InverseError, match=rf"std of reading 3 is {bad:g} V; give a standard error above"
+        ):
+            fit(tiny, penalty, readings, std.at[3].set(bad))
+    hidden = jax.jit(lambda std: fit(tiny, penalty, readings, std))(std.at[3].set(0.0))
+    np.testing.assert_allclose(hidden, fit(tiny, penalty, readings, std.at[3].set(jnp.nan)), atol=1e-9)
+    assert np.abs(hidden).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"steps": 0}, "steps is 0; give a whole number above zero"),
+        ({"steps": True}, "steps is True"),
+        ({"tolerance": -1.0}, "tolerance is -1.0; give a number of zero or more"),
+        ({"tolerance": float("nan")}, "tolerance is nan"),
+    ],
+)
+def test_steps_and_tolerances_that_no_fit_has_are_refused(tiny, settings, message):
+    readings = tiny.voltages(jnp.zeros(16))
+    with pytest.raises(je.imaging.InverseError, match=message):
+        je.gauss_newton(tiny, _tiny_penalty(tiny), readings, jnp.ones(len(readings)), **settings)
+
+
+@pytest.mark.parametrize("fit", [je.gauss_newton, je.imaging.least_squares_image])
+def test_readings_of_another_protocol_are_refused(tiny, fit):
+    with pytest.raises(je.imaging.InverseError, match=r"readings has shape \(3,\); give the"):
+        fit(tiny, _tiny_penalty(tiny), jnp.ones(3), jnp.ones(3))
+    readings = tiny.voltages(jnp.zeros(16))
+    with pytest.raises(je.imaging.InverseError, match="steps is 0"):
+        fit(tiny, _tiny_penalty(tiny), readings, jnp.ones(len(readings)), steps=0)
+
+
+def test_absolute_images_and_coats_tell_whether_they_converged(tiny, monkeypatch):
+    readings = tiny.voltages(0.8 * jnp.cos(jnp.arange(16.0)))
+    shown = je.imaging.absolute_image(tiny.model, readings, je.Pixels(4))
+    assert shown.converged
+    monkeypatch.setattr(one_frame, "gauss_newton_fit", partial(je.imaging.gauss_newton_fit, steps=1))
+    assert not je.imaging.absolute_image(tiny.model, readings, je.Pixels(4), error=1e-4).converged
+    classes = je.imaging.segment(tiny.model, tiny.voltages(jnp.zeros(16)), readings, je.Pixels(4), borders=None)
+    assert not classes.converged
+    assert not classes.borders_converged
+    with pytest.raises(je.imaging.InverseError, match="tolerance is -1"):
+        je.fit_background(tiny.model, readings, columns=4, tolerance=-1.0)

@@ -15,16 +15,24 @@ from ...model.discretisation import Model
 from ...model.forward_model import CoatedSheet, forward
 from ..noise import InverseError, require_real
 from ..priors import AbstractPrecision, GaussianSmooth
-from .frames import checked_frame, frame_error, require_explained, require_positive, sheet_level
-from .images import ImagePosterior, LogConductivity, Quadratic, most_probable, reading_weights
+from .frames import checked_frame, frame_error, require_explained, require_positive, require_steps, sheet_level
+from .images import (
+    IMAGE_STEPS,
+    IMAGE_TOLERANCE,
+    ImagePosterior,
+    LogConductivity,
+    Quadratic,
+    most_probable,
+    reading_weights,
+)
 
 # What is believed of a real coating: standard deviation of the logarithm of its conductivity, distance over which it
 # varies, m, and pixels of it along x, of less than half that distance on a skin of 0.2 m.
 COATING_STD, COATING_LENGTH, COATING_COLUMNS = 0.15, 0.03, 20
-# Relative error of a reading, from mesh, electrodes and current as they are modelled, and tolerance of the fit.
-COATING_ERROR, TOLERANCE = 1e-2, 2e-3
-# Steps of the fit, and share of the variance of its error that is kept.
-STEPS, ERROR_VARIANCE = 12, 0.95
+# Relative error of a reading, from mesh, electrodes and current as they are modelled.
+COATING_ERROR = 1e-2
+# Share of the variance of the error of the fit that is kept.
+ERROR_VARIANCE = 0.95
 
 
 def fit_background(
@@ -36,7 +44,7 @@ def fit_background(
     model_error: Float[ArrayLike, ""] = COATING_ERROR,
     columns: int = COATING_COLUMNS,
     basis: BasisMap | None = None,
-    tolerance: float = TOLERANCE,
+    tolerance: float = IMAGE_TOLERANCE,
 ) -> Float[Array, " elements"]:
     """Estimate the conductivity, (elements,) S, of the untouched sheet from one frame; for ``sigma=`` of `prepare` and
     `prepare_contacts`.
@@ -45,6 +53,9 @@ def fit_background(
     most probable conductivity for ``log sigma ~ N(level, std^2 exp(-r^2 / (2 length^2)))`` and independent errors
     ``model_error |v0|`` of the readings, at least a thousandth of their root mean square (`gauss_newton`). The level is
     that of the even sheet nearest to v0, so that a gain common to all readings does no harm.
+
+    A fit that has not converged after twelve steps ends with the best conductivity found so far. It is refused, as any
+    other, if it leaves a tenth of the readings unexplained.
 
     Works under `jax.jit` and `jax.grad`; values that are traced are not checked. Under jit give ``basis``.
 
@@ -70,6 +81,7 @@ def fit_background(
         print(jnp.std(jnp.log(sigma / truth)), "of", jnp.std(jnp.log(truth)), "left")
     """
     require_positive(std=std, length=length, model_error=model_error, columns=columns)
+    require_steps(IMAGE_STEPS, tolerance)
     image = Pixels(columns).on(model) if basis is None else basis
     frame, physics = even_coat("v0", model, v0, image)
     return _fitted("v0", physics, frame, std, length, model_error, tolerance)[0]
@@ -92,7 +104,7 @@ def _fitted(
     penalty = Quadratic(coat_precision(physics.image, length), 1 / jnp.asarray(std) ** 2)
     weight, readings = reading_weights(frame, frame_error(frame, model_error))
     posterior, start = ImagePosterior(physics, penalty, readings, weight), jnp.zeros(physics.image.size, frame.dtype)
-    x, state = most_probable(posterior, start, STEPS, tolerance)
+    x, state = most_probable(posterior, start, IMAGE_STEPS, tolerance)
     require_explained(name, "coating", physics.voltages(x), readings, jnp.isfinite(frame))
     return physics.sigma(x), state.quadratic.hessian.matrix
 
@@ -127,7 +139,7 @@ def _untouched_sheet(
 ) -> tuple[Float[Array, " elements"], Float[Array, "basis basis"], BasisMap]:
     """Conductivity of an untouched sheet, S, the precision of the logarithm of its pixels, and these pixels."""
     frame, physics = even_coat("untouched", model, untouched, Pixels(COATING_COLUMNS).on(model))
-    fit = _fitted("untouched", physics, frame, COATING_STD, COATING_LENGTH, COATING_ERROR, TOLERANCE)
+    fit = _fitted("untouched", physics, frame, COATING_STD, COATING_LENGTH, COATING_ERROR, IMAGE_TOLERANCE)
     return *fit, physics.image
 
 

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..._compile import require_known, verb
 from ...least_squares import LeastSquaresState, normal_equations, quadratic
@@ -37,7 +37,7 @@ from ..noise import InverseError
 from ..priors import GaussianSmooth
 from .background import COATING_LENGTH, COATING_STD
 from .frames import checked_frame, frame_error, sheet_level
-from .images import AbstractPosterior, most_probable, reading_weights
+from .images import IMAGE_STEPS, IMAGE_TOLERANCE, AbstractPosterior, most_probable, reading_weights
 
 STRENGTH_STD = 1.0  # of the logarithm of a press's strength, whose first value comes from its readings
 WIDTH_STD = 0.3  # of the logarithm of a press's width
@@ -97,12 +97,14 @@ class ElectrodeFit(eqx.Module):
     | covariance of all shifts, those of an electrode side by side               | (2 electrodes, 2 electrodes) | m^2 |
     | sigma: conductivity of the untouched sheet, on the mesh that is moved along | (elements,)      | S    |
     | misfit: root mean square of what is left of the readings, in their errors  | ()               | 1    |
+    | converged: whether the fit ended before its twelve steps did; if not, shifts may err by more than stated | () | |
     """
 
     shift: Float[Array, "electrodes 2"]
     covariance: Float[Array, "both both"]
     sigma: Float[Array, " elements"]
     misfit: Float[Array, ""]
+    converged: Bool[Array, ""]
 
     @property
     def standard_error(self) -> Float[Array, "electrodes 2"]:
@@ -151,7 +153,8 @@ def fit_electrodes(
     strength = _first_strengths(model, image, seen, level, settings)
     prior = _prior(image, model.electrodes, len(strength), settings)
     posterior = _Posterior(model, motion, image, level, settings, known, weight, seen.place, strength, prior)
-    return _described(posterior, *most_probable(posterior, jnp.zeros(posterior.size, model.dtype), 12, 2e-3))
+    start = jnp.zeros(posterior.size, model.dtype)
+    return _described(posterior, *most_probable(posterior, start, IMAGE_STEPS, IMAGE_TOLERANCE))
 
 
 def _no_presses(model: Model) -> KnownPresses:
@@ -347,4 +350,5 @@ def _described(posterior: _Posterior, x: Float[Array, " n"], state: LeastSquares
         shift**2 * 0.5 * (covariance + covariance.T),
         posterior.sheet(parts)[1],
         jnp.sqrt(square / jnp.maximum(used, 1)),
+        state.converged,
     )

@@ -92,6 +92,14 @@ def require_positive(**values: Any) -> None:
             raise InverseError(f"{name} is {value}; give a number above zero")
 
 
+def require_steps(steps: int, tolerance: Any = 0.0) -> None:
+    """Raise InverseError unless a fit of so many steps, to such a tolerance, can be made."""
+    if not isinstance(steps, int | np.integer) or isinstance(steps, bool) or steps < 1:
+        raise InverseError(f"steps is {steps}; give a whole number above zero")
+    if not is_traced(tolerance) and not 0 <= tolerance < np.inf:
+        raise InverseError(f"tolerance is {tolerance}; give a number of zero or more, such as 2e-3")
+
+
 @verb
 def _unexplained(
     found: Float[Array, " readings"], known: Float[Array, " readings"], there: Bool[Array, " readings"]

@@ -6,12 +6,12 @@ voltages that the model gives for the reference: ``readings = physics.voltages(0
 """
 
 from abc import abstractmethod
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..._compile import full_precision, verb
 from ...least_squares import Cholesky, ImplicitStep, LeastSquaresState, LevenbergMarquardt, normal_equations, quadratic
@@ -21,7 +21,13 @@ from ...model.discretisation import Model
 from ...model.forward_model import forward, terminal_matrix, voltages
 from ...model.sensitivity import field_jacobian, scaled_jacobian, solved_fields
 from ...registry import AbstractChoice, limited
+from ..noise import InverseError
 from ..priors import AbstractPrecision
+from .frames import checked_errors, require_steps
+
+IMAGE_STEPS, IMAGE_TOLERANCE = 12, 2e-3
+"""Largest number of steps of a fit through the full forward map, and the fall of its objective that is next to nothing,
+over the objective."""
 
 
 class LogConductivity(eqx.Module):
@@ -134,20 +140,27 @@ def gauss_newton(
     readings: Float[Array, " readings"],
     std: Float[Array, " readings"],
     *,
-    steps: int = 12,
-    tolerance: float = 2e-3,
+    steps: int = IMAGE_STEPS,
+    tolerance: float = IMAGE_TOLERANCE,
 ) -> Float[Array, " basis"]:
     """argmin over x of ``|(readings - voltages(x)) / std|^2 / 2 + penalty(x)``, from x = 0.
 
     Each step computes the Jacobian and the penalty's matrix at the present image, and is halved until the sum falls.
-    The last step is the one that promises a fall of less than ``tolerance`` of the sum. Readings that are not finite
-    are left out.
+    The last step is the one that promises a fall of less than ``tolerance`` of the sum. If no step within ``steps`` is
+    small enough, the image after the last of them is returned: its sum is the least so far, and may be far from the
+    minimum. `gauss_newton_fit` says whether that is so.
+
+    Readings that are not finite, and readings whose error is not, are left out.
 
     Works under `jax.jit`, `jax.vmap` and `jax.grad`. Derivatives are those of the exact minimum (`ImplicitStep`):
-    precise derivatives need a small tolerance.
+    precise derivatives need a small tolerance. Errors of zero or less that JAX hides leave their readings out.
 
     Args:
-        steps: largest number of steps.
+        readings, std: the readings and their standard errors, V.
+        steps: largest number of steps; each halving is one.
+
+    Raises:
+        InverseError: if a shape or a value is wrong, such as a ``std`` of zero.
 
     Example:
         physics = je.imaging.LogConductivity(model, coarse, model.background.mean())
@@ -155,9 +168,42 @@ def gauss_newton(
         x = je.gauss_newton(physics, je.imaging.IsotropicVariation(), v0 + dv, noise, steps=3)
         sigma = physics.sigma(x)  # S, of each element
     """
-    weight, readings = reading_weights(jnp.asarray(readings), jnp.asarray(std))
-    start = jnp.zeros(physics.image.size, readings.dtype)
-    return most_probable(ImagePosterior(physics, penalty, readings, weight), start, steps, tolerance)[0]
+    return gauss_newton_fit(physics, penalty, readings, std, steps=steps, tolerance=tolerance).image
+
+
+class ImageFit(NamedTuple):
+    """What `gauss_newton_fit` finds.
+
+    | meaning                                                                                      | shape    |
+    |----------------------------------------------------------------------------------------------|----------|
+    | image: logarithm of the conductivity over the background's                                   | (basis,) |
+    | converged: whether the last step was next to nothing; if not, the number of steps ended the fit | ()    |
+    """
+
+    image: Float[Array, " basis"]
+    converged: Bool[Array, ""]
+
+
+def gauss_newton_fit(
+    physics: LogConductivity,
+    penalty: AbstractPenalty,
+    readings: Float[Array, " readings"],
+    std: Float[Array, " readings"],
+    *,
+    steps: int = IMAGE_STEPS,
+    tolerance: float = IMAGE_TOLERANCE,
+) -> ImageFit:
+    """`gauss_newton`, and whether it converged. Arguments and errors are the same.
+
+    Example:
+        fit = je.imaging.gauss_newton_fit(physics, je.imaging.IsotropicVariation(), v0 + dv, noise)
+        print(fit.image.max(), "at the minimum" if fit.converged else "after the last step allowed")
+    """
+    require_steps(steps, tolerance)
+    posterior = _image_posterior(physics, penalty, readings, std)
+    start = jnp.zeros(physics.image.size, posterior.readings.dtype)
+    x, state = most_probable(posterior, start, steps, tolerance)
+    return ImageFit(x, state.converged)
 
 
 class AbstractPosterior(eqx.Module):
@@ -195,12 +241,29 @@ class ImagePosterior(AbstractPosterior):
         return quadratic(value, data.grad + matrix @ x, data.hessian.matrix + matrix)
 
 
+def _image_posterior(
+    physics: LogConductivity,
+    penalty: AbstractPenalty,
+    readings: Float[Array, " readings"],
+    std: Float[Array, " readings"],
+) -> ImagePosterior:
+    """The posterior of an image, from readings and their errors, V; raises InverseError for what are none."""
+    values = jnp.asarray(readings)
+    if values.shape != (physics.model.readings,):
+        raise InverseError(
+            f"readings has shape {values.shape}; give the {physics.model.readings} readings of one frame"
+        )
+    weight, values = reading_weights(values, checked_errors("std", std, values))
+    return ImagePosterior(physics, penalty, values, weight)
+
+
 @verb
 def most_probable(
     posterior: AbstractPosterior, start: Float[Array, " n"], steps: int, tolerance: float, *, damped: bool = False
 ) -> tuple[Float[Array, " n"], LeastSquaresState]:
     """The x of largest posterior probability, by Gauss and Newton's method as `gauss_newton` describes it; and where
-    the fit stands then, whose quadratic is that before the last step, next to nothing.
+    the fit stands then, whose quadratic is that before the last step, and whose ``converged`` says whether this step
+    was next to nothing. If not, x is the best that was found in so many steps.
 
     With ``damped`` by Levenberg and Marquardt's, where the quadratic holds for small steps only.
     """
@@ -224,8 +287,8 @@ def most_probable(
 def reading_weights(
     readings: Float[Array, "*frames readings"], std: Float[Array, "*frames readings"]
 ) -> tuple[Float[Array, "*frames readings"], Float[Array, "*frames readings"]]:
-    """One over the noise, and the readings; both 0 where a reading or its noise is not finite."""
-    used = jnp.isfinite(readings) & jnp.isfinite(std)
+    """One over the noise, and the readings; both 0 where a reading or its noise is not finite, or the noise is zero."""
+    used = jnp.isfinite(readings) & jnp.isfinite(std) & (std > 0)
     return jnp.where(used, 1 / jnp.where(used, std, 1), 0), jnp.where(used, readings, 0)
 
 
@@ -244,11 +307,15 @@ def least_squares_image(
     are left out.
 
     Args:
+        readings, std: the readings and their standard errors, V.
         solver: of optimistix; default: `LevenbergMarquardt`, to a millionth (float32: a thousandth).
         steps: largest number of steps.
 
     Returns:
         (basis,); NaN throughout if the solver did not converge.
+
+    Raises:
+        InverseError: if a shape or a value is wrong, such as a ``std`` of zero.
 
     Example:
         prior = je.Tikhonov().precision(physics.slopes(jnp.zeros(coarse.size)), coarse.picture)
@@ -256,10 +323,11 @@ def least_squares_image(
             physics, je.imaging.Quadratic(prior, strength=1.0), v0 + dv, noise
         )
     """
-    weight, readings = reading_weights(jnp.asarray(readings), jnp.asarray(std))
-    tolerance = 1e-6 if readings.dtype == jnp.float64 else 1e-3
+    require_steps(steps)
+    posterior = _image_posterior(physics, penalty, readings, std)
+    tolerance = 1e-6 if posterior.readings.dtype == jnp.float64 else 1e-3
     solver = LevenbergMarquardt(tolerance, tolerance) if solver is None else solver
-    return _solved(ImagePosterior(physics, penalty, readings, weight), solver, steps)
+    return _solved(posterior, solver, steps)
 
 
 @verb

@@ -1,11 +1,12 @@
 """The conductivity that one frame shows, by one call; and images whose errors grow until they explain what is left."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..._compile import require_known
 from ...model.bases import AbstractBasis, BasisMap, Picture, Pixels
@@ -13,7 +14,7 @@ from ...model.discretisation import Model, require_model
 from ...model.forward_model import forward
 from ..noise import InverseError
 from .frames import checked_frame, frame_error, require_positive, sheet_level
-from .images import AbstractPenalty, IsotropicVariation, LogConductivity, gauss_newton
+from .images import AbstractPenalty, IsotropicVariation, LogConductivity, gauss_newton_fit
 
 WEIGHT = 0.0064
 """Of the penalty, for each reading: errors are mostly the model's, and common to readings, not noise that averages."""
@@ -35,6 +36,7 @@ class AbsoluteImage(eqx.Module):
     | picture that the image belongs to                                    |             |      |
     | errors: standard error of each reading that was believed             | (readings,) | V    |
     | misfit: root mean square of what the image leaves, over these errors | ()          | 1    |
+    | converged: whether the fit ended before its twelve steps did; if not, the image may be far from the best | () | |
     """
 
     sigma: Float[Array, " elements"]
@@ -42,6 +44,7 @@ class AbsoluteImage(eqx.Module):
     picture: Picture
     errors: Float[Array, " readings"]
     misfit: Float[Array, ""]
+    converged: Bool[Array, ""]
 
 
 def absolute_image(
@@ -83,8 +86,9 @@ def absolute_image(
     physics, own = LogConductivity(model, image, level), frame_error(readings, error)
     used = jnp.sum(jnp.isfinite(readings), dtype=model.dtype)
     penalty = variation_of(used) if penalty is None else penalty
-    found, std, misfit = believed_image(physics, penalty, readings, lambda growth: growth * own)
-    return AbsoluteImage(physics.sigma(found), level * jnp.exp(found), image.picture, std, misfit)
+    found = believed_image(physics, penalty, readings, lambda growth: growth * own)
+    seen = physics.sigma(found.image), level * jnp.exp(found.image)
+    return AbsoluteImage(*seen, image.picture, found.errors, found.misfit, found.converged)
 
 
 def variation_of(readings: Float[Array, ""]) -> IsotropicVariation:
@@ -101,20 +105,29 @@ def picture_basis(model: Model, basis: AbstractBasis | BasisMap | None) -> Basis
     return image
 
 
+class BelievedImage(NamedTuple):
+    """An image; errors of the readings that were believed, V; the root mean square of what the image leaves, over
+    them; whether the fit converged."""
+
+    image: Float[Array, " basis"]
+    errors: Float[Array, " readings"]
+    misfit: Float[Array, ""]
+    converged: Bool[Array, ""]
+
+
 def believed_image(
     physics: LogConductivity,
     penalty: AbstractPenalty,
     target: Float[Array, " readings"],
     errors: Callable[[float], Float[Array, " readings"]],
-) -> tuple[Float[Array, " basis"], Float[Array, " readings"], Float[Array, ""]]:
-    """The image, fitted anew with larger errors where it leaves more of the readings than they tell; its errors, V; and
-    the root mean square of what it leaves, over them."""
+) -> BelievedImage:
+    """The image, fitted anew with larger errors where it leaves more of the readings than they tell."""
     growth = 1.0
     for _ in range(1 + MORE_FITS):
         std = errors(growth)
-        found = gauss_newton(physics, penalty, target, std)
+        found, converged = gauss_newton_fit(physics, penalty, target, std)
         misfit = jnp.sqrt(jnp.nanmean(((target - physics.voltages(found)) / std) ** 2))
         if not misfit > BELIEVED_MISFIT:
             break
         growth *= float(misfit)
-    return found, std, misfit
+    return BelievedImage(found, std, misfit, converged)
