@@ -53,7 +53,10 @@ class EqualNoise(AbstractNoise):
 
 
 class MeasuredNoise(AbstractNoise):
-    """Each reading by its standard deviation without contact. Readings are taken as independent."""
+    """Each reading by its standard deviation without contact, at least a tenth of the median of all.
+
+    Readings are taken as independent.
+    """
 
     name: ClassVar[str] = "measured"
 
@@ -68,6 +71,8 @@ class MeasuredNoise(AbstractNoise):
 
 class CorrelatedNoise(AbstractNoise):
     """The readings by their covariance without contact, see `noise_covariance`: for an instrument with crosstalk.
+
+    Standard deviations are at least a tenth of their median, as those of `MeasuredNoise`.
 
     Example:
         crosstalk = je.Imaging(je.Pixels(10), noise=je.imaging.CorrelatedNoise()).prepare(
@@ -86,7 +91,10 @@ class CorrelatedNoise(AbstractNoise):
         moves = frames.std(0) > 0
         changing[used] = moves
         out = np.diag(deviation**2)  # a reading that does not change at all is taken as independent
-        out[np.ix_(changing, changing)] = noise_covariance(frames[:, moves])
+        covariance = noise_covariance(frames[:, moves])
+        # The floor widens a reading and leaves its correlations.
+        wider = np.maximum(_least_deviation(frames) / np.sqrt(np.diagonal(covariance)), 1)
+        out[np.ix_(changing, changing)] = covariance * np.outer(wider, wider)
         return out
 
 
@@ -116,9 +124,18 @@ def _used(
 
 def _deviations(frames: np.ndarray) -> np.ndarray:
     """Standard deviation of each reading about zero, not below `LEAST_DEVIATION` of the median."""
-    deviation = np.sqrt(np.mean(frames**2, axis=0))
-    least = LEAST_DEVIATION * np.median(deviation)
+    floored: np.ndarray = np.maximum(_root_mean_square(frames), _least_deviation(frames))
+    return floored
+
+
+def _least_deviation(frames: np.ndarray) -> float:
+    """The smallest standard deviation that is believed, V; raises InverseError if most readings do not change."""
+    least = LEAST_DEVIATION * float(np.median(_root_mean_square(frames)))
     if not least > 0:
         raise InverseError("most readings do not change at all without contact; choose EqualNoise")
-    floored: np.ndarray = np.maximum(deviation, least)
-    return floored
+    return least
+
+
+def _root_mean_square(frames: np.ndarray) -> np.ndarray:
+    found: np.ndarray = np.sqrt(np.mean(frames**2, axis=0))
+    return found
