@@ -19,6 +19,7 @@ from .._compile import verb
 from ..linalg.lapack import eigh
 from ..registry import AbstractChoice, Registry, limited
 from .methods import Problem
+from .noise import InverseError
 
 # Takes frames, (..., readings) V, to whitened ones, (..., k).
 Whiten = Callable[[Array], Array]
@@ -26,7 +27,7 @@ Whiten = Callable[[Array], Array]
 _RANGE = np.logspace(-4, 2, 241)
 
 
-class HyperparameterError(ValueError):
+class HyperparameterError(InverseError):
     """No hyperparameter can be chosen in this way; the message says why.
 
     Example:
@@ -68,7 +69,10 @@ def spectrum(problem: Problem) -> Spectrum:
 
 
 class AbstractHyperparameter(AbstractChoice):
-    """A way to choose the hyperparameter, given to `prepare` in place of a number."""
+    """A way to choose the hyperparameter, given to `prepare` in place of a number.
+
+    ``needs_noise``: whether it compares with the noise, which then has to be given to `prepare`.
+    """
 
     needs_noise: ClassVar[bool] = False
 

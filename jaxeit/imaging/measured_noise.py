@@ -15,9 +15,14 @@ LEAST_DEVIATION = 0.1  # of the median deviation: a reading that hardly changes 
 
 
 class AbstractNoise(eqx.Module):
-    """A choice of the readings' noise; ``needs_frames``: whether it must be measured."""
+    """A choice of the readings' noise.
+
+    ``needs_frames``: whether it must be measured. ``has_size``: whether it is known in V, so that images have standard
+    deviations and a hyperparameter can be chosen by it.
+    """
 
     needs_frames: ClassVar[bool] = True
+    has_size: ClassVar[bool] = True
 
     @abstractmethod
     def measured(
@@ -45,6 +50,7 @@ class EqualNoise(AbstractNoise):
 
     name: ClassVar[str] = "equal"
     needs_frames: ClassVar[bool] = False
+    has_size: ClassVar[bool] = False
 
     def measured(
         self, quiet: Float[ArrayLike, "frames readings"] | None, channels: Bool[ArrayLike, " readings"] | None = None

@@ -118,19 +118,19 @@ def prepare(
     Raises:
         InverseError: if a value is out of range or no channel is left, or the result is not finite; if both
             ``untouched`` and ``sigma`` are given, or no coating explains the untouched frame; if prior, method or
-            basis is an object of another kind, such as a method in the place of the prior; or if jit, grad or vmap
-            hides the protocol or the channels.
+            basis is an object of another kind, such as a method in the place of the prior; if prior, method,
+            hyperparameter and noise do not go together; or if jit, grad or vmap hides the protocol or the channels.
         SceneError: if ``model`` is no model, such as a skin.
         HyperparameterError: if the hyperparameter is to be chosen by values that jit, grad or vmap hides.
     """
     require_model(model)
     method, prior, basis = method or OneStep(), prior or Noser(), basis or Pixels()
-    require_choices(prior, method, basis, hyperparameter)
+    require_choices(prior, method, basis, hyperparameter, noise is not None)
     image = basis if isinstance(basis, BasisMap) else basis.on(model)
     sigma = sheet_of(model, untouched, sigma, channels)
     found = whitened_readings(model, noise, channels)
     problem = _problem(model, sigma, image, found, prior)
-    chosen = _chosen(hyperparameter, problem, found, noise is not None)
+    chosen = _chosen(hyperparameter, problem, found)
     check_range(chosen, method, model.dtype)
     problem = replace(problem, hyperparameter=jnp.asarray(chosen, model.dtype))
     linear = method if isinstance(method, AbstractLinearMethod) else OneStep()
@@ -210,13 +210,11 @@ def _build(
     return recon, followed
 
 
-def _chosen(hyperparameter: Any, problem: Problem, found: Whitened, noise_is_known: bool) -> Any:
+def _chosen(hyperparameter: Any, problem: Problem, found: Whitened) -> Any:
     """The hyperparameter as a number, or as an array where JAX traces it."""
     if not isinstance(hyperparameter, AbstractHyperparameter):
         return hyperparameter if is_traced(hyperparameter) else float(hyperparameter)
     name = type(hyperparameter).__name__
-    if hyperparameter.needs_noise and not noise_is_known:
-        raise InverseError(f"{name} compares with the noise; give prepare(..., noise=...)")
     if is_traced(hyperparameter, problem):
         raise HyperparameterError(
             f"{name} chooses by looking at values, which jit, grad or vmap hides; choose once outside the transformed "
@@ -225,8 +223,8 @@ def _chosen(hyperparameter: Any, problem: Problem, found: Whitened, noise_is_kno
     return hyperparameter.choose(spectrum(problem), partial(_whiten, found, problem.jacobian.dtype))
 
 
-def require_choices(prior: Any, method: Any, basis: Any, weight: Any) -> None:
-    """Refuse a choice that stands in the place of another."""
+def require_choices(prior: Any, method: Any, basis: Any, weight: Any, noise_is_known: bool) -> None:
+    """Refuse a choice that stands in the place of another, and choices that do not go together."""
     for name, choice, kinds, example in (
         ("prior", prior, AbstractPrior, "prior=Noser()"),
         ("method", method, (AbstractLinearMethod, AbstractIterativeMethod), "method=OneStep()"),
@@ -237,6 +235,17 @@ def require_choices(prior: Any, method: Any, basis: Any, weight: Any) -> None:
         raise InverseError(
             f"the prior {type(prior).__name__} changes with the image, and the method {type(method).__name__} takes it "
             "only once; choose the method Reweighted, or another prior"
+        )
+    if method.needs_diagonal_prior and prior.diagonal is False:
+        raise InverseError(
+            f"the method {type(method).__name__} needs a diagonal prior, which {type(prior).__name__} is not; choose "
+            "the prior Noser or Tikhonov, or another method"
+        )
+    if isinstance(weight, AbstractHyperparameter) and weight.needs_noise and not noise_is_known:
+        raise InverseError(
+            f"the hyperparameter {type(weight).__name__} compares with the noise, whose size is not known; give the "
+            "noise in V, prepare(..., noise=...), or choose noise that is measured, as Imaging(noise=MeasuredNoise()) "
+            "or --noise measured"
         )
     if not (isinstance(weight, AbstractHyperparameter) or is_traced(weight) or is_number(weight)):
         ways = "a number, such as 0.1, or a way to choose one, such as je.imaging.LCurve(dv)"

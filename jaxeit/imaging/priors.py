@@ -138,9 +138,11 @@ class AbstractPrior(AbstractChoice):
     """A choice of R.  A new prior is one class in a module of this room; `PRIORS` finds it there.
 
     ``follows_image``: whether R depends on the image; such a prior needs a method that asks for R at each image.
+    ``diagonal``: whether R is diagonal, as `SparseBayes` needs; None: what `precision` returns tells.
     """
 
     follows_image: ClassVar[bool] = False
+    diagonal: ClassVar[bool | None] = None
 
     @abstractmethod
     def precision(
@@ -166,6 +168,7 @@ class Noser(AbstractPrior):
     | floor    | 1e-3    | to 1     |
     """
 
+    diagonal: ClassVar[bool | None] = True
     exponent: float = limited(0.5, least=0, most=1)
     floor: float = limited(1e-3, above=0, most=1)
 
@@ -182,6 +185,8 @@ class Noser(AbstractPrior):
 class Tikhonov(AbstractPrior):
     """``R = diag(area)``: the same penalty per unit of area everywhere, whatever the mesh."""
 
+    diagonal: ClassVar[bool | None] = True
+
     def precision(
         self, jacobian: Float[Array, "k basis"], picture: Picture, at: Float[Array, " basis"] | None = None
     ) -> Diagonal:
@@ -195,6 +200,7 @@ class Laplace(AbstractPrior):
     EIDORS' `prior_laplace`, whose R is the graph Laplacian as here).
     """
 
+    diagonal: ClassVar[bool | None] = False
     floor: float = limited(1e-3, above=0)
 
     def precision(
@@ -223,6 +229,7 @@ class GaussianSmooth(AbstractPrior):
     | noser                                                       | False   |      |
     """
 
+    diagonal: ClassVar[bool | None] = False
     length: float = limited(0.01, above=0, most=LONGEST)
     nugget: float = limited(1e-3, above=0)
     noser: bool = eqx.field(static=True, default=False)
@@ -247,6 +254,7 @@ class TotalVariation(AbstractPrior):
     """
 
     follows_image: ClassVar[bool] = True
+    diagonal: ClassVar[bool | None] = False
     beta: float = limited(1e-2, above=0)
     floor: float = limited(1e-3, above=0)
 

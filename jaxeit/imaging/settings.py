@@ -1,5 +1,6 @@
 """The choices that make an image, as one object."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from jax.typing import ArrayLike
@@ -30,8 +31,9 @@ class Imaging:
     | noise: how the readings are weighed                            | `EqualNoise`     |
 
     Raises:
-        InverseError: for a hyperparameter that is not above zero, a choice in the place of another, or a prior that
-            changes with the image and a method that takes it only once.
+        InverseError: for a hyperparameter that is not above zero, a choice in the place of another, or choices that do
+            not go together: a prior that changes with the image and a method that takes it only once, a method that
+            needs a diagonal prior and another one, a hyperparameter that compares with noise and `EqualNoise`.
 
     Example:
         settings = je.Imaging(je.Pixels(10), prior=je.Tikhonov(), noise=je.imaging.MeasuredNoise())
@@ -45,10 +47,10 @@ class Imaging:
     noise: AbstractNoise = field(default_factory=EqualNoise)
 
     def __post_init__(self) -> None:
-        require_choices(self.prior, self.method, self.basis, self.hyperparameter)
         require_kind(
             self.noise, AbstractNoise, InverseError, "a noise", "an object, such as je.imaging.MeasuredNoise()"
         )
+        require_choices(self.prior, self.method, self.basis, self.hyperparameter, self.noise.has_size)
         weight = self.hyperparameter
         if isinstance(weight, int | float) and not 0 < weight < float("inf"):
             raise InverseError(f"the hyperparameter is {weight}; give a number above zero, such as 0.1")
@@ -69,6 +71,7 @@ class Imaging:
         channels: Bool[ArrayLike, " readings"] | None = None,
         untouched: Float[ArrayLike, " readings"] | None = None,
         sigma: Float[Array, " elements"] | None = None,
+        provenance: Mapping[str, str] | None = None,
     ) -> Reconstructor | IterativeReconstructor:
         """The reconstructor that these choices make of a model, by `prepare`.
 
@@ -77,7 +80,7 @@ class Imaging:
                 is `EqualNoise`.
             frames: differences of readings, at least one of a touch, V; needed by a ``hyperparameter`` that looks at
                 frames and has none of its own.
-            channels, untouched, sigma: as for `prepare`.
+            channels, untouched, sigma, provenance: as for `prepare`.
 
         Raises:
             InverseError: as for `prepare`, or if the choices need frames that are not given.
@@ -87,6 +90,6 @@ class Imaging:
         if isinstance(weight, AbstractHyperparameter) and frames is not None:
             weight = weight.on(frames)
         noise = self.noise.measured(quiet, channels)
-        sheet: Settings = {"untouched": untouched, "sigma": sigma}
+        sheet: Settings = {"untouched": untouched, "sigma": sigma, "provenance": provenance}
         settings: Settings = {"noise": noise, "hyperparameter": weight, "channels": channels} | sheet
         return prepare(model, self.prior, self.method, self.basis, **settings)

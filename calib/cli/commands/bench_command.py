@@ -68,12 +68,19 @@ def _rungs(args: argparse.Namespace) -> tuple["Choice", ...] | None:
     """The default settings with the imaging of the options; None: the defaults of `jaxeit.ladder`."""
     import jaxeit as je
 
-    imaging = imaging_of(args, je.Imaging())
+    # With measured noise, so that a hyperparameter that needs it is answered here.
+    imaging = imaging_of(args, je.Imaging(noise=je.imaging.MeasuredNoise()))
+    weight = imaging.hyperparameter
+    compares = isinstance(weight, je.imaging.AbstractHyperparameter) and weight.needs_noise
+    if compares or (args.noise is not None and imaging.noise.needs_frames):
+        raise ValueError(
+            "the study's readings have no noise to be measured; leave --noise out, and choose a hyperparameter that "
+            "does not compare with the noise, such as a number"
+        )
+    imaging = replace(imaging, noise=je.imaging.EqualNoise()) if args.noise is None else imaging
     usual = je.accuracy.few_choices() if args.smoke else None
     if imaging == je.Imaging():
         return usual
-    if imaging.noise.needs_frames or (args.hyperparameter or "").startswith("discrepancy"):
-        raise ValueError("the study's readings have no noise to be measured; leave --noise and discrepancy out")
     standard = je.accuracy.Choice("usual images", je.Fidelity.standard())
     rungs = usual or (*je.accuracy.fidelity_choices(), standard)
     return tuple(

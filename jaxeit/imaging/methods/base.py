@@ -57,9 +57,11 @@ class AbstractMethod(AbstractChoice):
     """A choice of method: an `AbstractLinearMethod` or an `AbstractIterativeMethod`.
 
     ``follows_prior``: whether the method evaluates the prior again at each image, as `TotalVariation` needs.
+    ``needs_diagonal_prior``: whether the R of the prior must be diagonal, as `Noser` and `Tikhonov` have it.
     """
 
     follows_prior: ClassVar[bool] = False
+    needs_diagonal_prior: ClassVar[bool] = False
 
 
 class AbstractLinearMethod(AbstractMethod):

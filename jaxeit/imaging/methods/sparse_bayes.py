@@ -1,11 +1,14 @@
 """Sparse Bayesian learning: images of few pixels."""
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ...linalg.lapack import cho_solve, cholesky, solve_triangular
 from ...registry import limited
+from ..noise import InverseError
 from ..priors import Diagonal
 from .base import AbstractIterativeMethod, Problem
 
@@ -22,12 +25,13 @@ class SparseBayes(AbstractIterativeMethod):
     for g is MacKay's, which Tipping takes; it needs a fraction of the steps of ``g_i <- x_i^2 + g_i (1 - q_i)``.
     """
 
+    needs_diagonal_prior: ClassVar[bool] = True
     steps: int = limited(15, least=1, static=True)
 
     def image(self, problem: Problem, y: Float[Array, " k"]) -> Float[Array, " basis"]:
         j, precision = problem.jacobian, problem.precision()
         if not isinstance(precision, Diagonal):
-            raise ValueError("SparseBayes needs a diagonal prior: Noser() or Tikhonov()")
+            raise InverseError("SparseBayes needs a diagonal prior: Noser() or Tikhonov()")
         top = jnp.max(jnp.abs(y))
         top = jnp.where(top > 0, top, 1)
         y = y / top
