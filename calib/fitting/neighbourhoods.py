@@ -14,6 +14,7 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
 from .curves.base import AbstractCurve
+from .curves.samples import by_rows
 from .fields.base import AbstractField
 from .fields.fitted import FittedField, centred_features
 from .fields.places import Places
@@ -36,7 +37,9 @@ def field_neighbourhoods(fitted: FittedField, places: Places, share: np.ndarray)
         places: of the presses.
         share: of each pad in a press, (presses, pads).
     """
-    rows = np.einsum("np,npm->nm", np.nan_to_num(share), np.asarray(centred_features(fitted, places), float))
+    rows = np.einsum(
+        "np,npm->nm", np.nan_to_num(share), by_rows(centred_features, places, before=(fitted,)).astype(float)
+    )
     shapes = np.tile(fitted.field.shapes(), (1, 1 if fitted.field.shared else fitted.geometry.pads))
     rows = rows * np.sqrt(shapes.mean(0))
     length = np.linalg.norm(rows, axis=1, keepdims=True)

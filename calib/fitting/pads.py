@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 import jaxeit as je
 
@@ -24,7 +24,7 @@ from ..presses.pooled import PressData
 from .curves.base import AbstractCurve
 from .curves.fit import fit_curves
 from .curves.fitted import FittedCurve, Prediction, predict_pads
-from .curves.samples import bucket
+from .curves.samples import bucket, by_rows
 from .fields.base import AbstractField
 from .fields.fit import fit_field
 from .fields.fitted import FittedField, LogGain, log_gain
@@ -185,7 +185,7 @@ class PadModel(eqx.Module):
         them, and that of the sensors. Without places, the gain is one, and the standard error includes its variation
         over the pad. A force is not valid outside the fitted pressures, or where the fit of the pad failed.
         """
-        found = pad_forces(self, jnp.asarray(pressures, self.dtype), places)
+        found = by_rows(pad_forces, np.asarray(pressures, self.dtype), places, before=(self,))
         return np.asarray(found.force), np.asarray(found.standard_error), np.asarray(found.valid)
 
     def hold_forces(
@@ -200,7 +200,7 @@ class PadModel(eqx.Module):
             pressures: means over the holds of presses, (n, pads) Pa.
             places: as for `pad_forces`.
         """
-        found = forces(self, jnp.asarray(pressures, self.dtype), places)
+        found = by_rows(forces, np.asarray(pressures, self.dtype), places, before=(self,))
         force, noise = np.asarray(found.force), self._noise if self.hold_noise is None else self.hold_noise
         return force, noise.half_widths(force, np.asarray(found.total_variance))
 
@@ -221,7 +221,8 @@ class PadModel(eqx.Module):
     def log_gains(self, places: Places) -> np.ndarray:
         """Log of the gain of each pad at places, (n, pads). The model must have a field."""
         assert self.field is not None
-        return np.asarray(log_gain(self.field, places).mean)
+        found: LogGain = by_rows(log_gain, places, before=(self.field,))
+        return np.asarray(found.mean)
 
 
 @je.verb
@@ -262,14 +263,14 @@ def fit_pads(
     for _ in range(0 if alone else ALTERNATIONS):
         if field is not None and places is not None:
             fitted = _field(field, curves, gain, presses, use)
-            gain = np.asarray(log_gain(fitted, places).mean)
+            gain = by_rows(log_gain, places, before=(fitted,)).mean
         curves = _curves(curve, data, _carried(curves, data, gain), gain, use, loss)
     return PadModel(curves, fitted)
 
 
 def _carried(curves: FittedCurve, data: PressData, gain: np.ndarray) -> np.ndarray:
     """Force on each pad at all samples, (pads, n) N: the measured force less that of the other pads by their curves."""
-    each = np.nan_to_num(np.asarray(_curve_forces(curves, jax.device_put(data.sample_pressure))))
+    each = np.nan_to_num(by_rows(_curve_forces, data.sample_pressure.T, before=(curves,)).T)
     each *= np.exp(gain[data.sample_press].T)
     return np.asarray(data.sample_force - (each.sum(0) - each))
 
@@ -296,7 +297,7 @@ def _field(
 ) -> FittedField:
     """The field fitted to log forces over those of the curves, which were fitted with the log-gain `gain`."""
     data = presses.data
-    force = np.asarray(_curve_forces(curves, jax.device_put(data.pressure.T))).T * np.exp(gain)
+    force = by_rows(_curve_forces, data.pressure, before=(curves,)) * np.exp(gain)
     part = np.maximum(np.nan_to_num(force), 0)
     total = part.sum(1)
     use = use & (total > 0) & (data.force > 0)
@@ -327,27 +328,28 @@ class PadForces(NamedTuple):
 
 def over_holds(model: PadModel, presses: LocatedPresses) -> PadForces:
     """Pad forces over the holds of the presses, (presses, pads)."""
-    return _of_fits(model, predict(model, jax.device_put(presses.data.pressure), presses.places))
+    return _of_fits(model, by_rows(predict, presses.data.pressure, presses.places, before=(model,)))
 
 
 def along_presses(model: PadModel, presses: LocatedPresses) -> PadForces:
     """Pad forces at all samples of the presses, (n, pads)."""
     data = presses.data
-    places = None if model.field is None else presses.places
-    own, press = jax.device_put((data.sample_pressure.T, data.sample_press))
-    return _of_fits(model, _along(model, own, press, places))
+    gain = (
+        None
+        if model.field is None or presses.places is None
+        else by_rows(log_gain, presses.places, before=(model.field,))
+    )
+    rows = data.sample_pressure.T, None if gain is None else LogGain(*(part[data.sample_press] for part in gain))
+    return _of_fits(model, by_rows(_with_gains, *rows, before=(model,)))
 
 
 @je.verb
-def _along(
-    model: PadModel, own: Float[Array, "n pads"], press: Int[Array, " n"], places: Places | None
-) -> PadPrediction:
-    """`PadModel.predict` at samples of presses, from the places of the presses (None: the curves alone)."""
+def _with_gains(model: PadModel, own: Float[Array, "n pads"], gain: LogGain | None) -> PadPrediction:
+    """`PadModel.predict` with known gains (None: the curves alone)."""
     found = _of_curves(model.curves, own)
-    if model.field is None or places is None:
-        return independent(found)
-    gain = model.field.log_gain(places)  # of the presses, which are far fewer than their samples
-    return with_gain(found, LogGain(gain.mean[press], gain.variance[press]), model.field.field.shared)
+    return (
+        independent(found) if model.field is None or gain is None else with_gain(found, gain, model.field.field.shared)
+    )
 
 
 def _of_fits(model: PadModel, found: PadPrediction) -> PadForces:
@@ -356,9 +358,9 @@ def _of_fits(model: PadModel, found: PadPrediction) -> PadForces:
 
 
 @je.verb
-def _curve_forces(curves: FittedCurve, pressure: Float[Array, "pads n"]) -> Float[Array, "pads n"]:
-    found: Array = eqx.filter_vmap(lambda fitted, p: fitted.curve(fitted.parameters, p))(curves, pressure)
-    return found * _load(curves, pressure)
+def _curve_forces(curves: FittedCurve, pressure: Float[Array, "n pads"]) -> Float[Array, "n pads"]:
+    found: Array = eqx.filter_vmap(lambda fitted, p: fitted.curve(fitted.parameters, p))(curves, pressure.T)
+    return (found * _load(curves, pressure.T)).T
 
 
 def _of_curves(curves: FittedCurve, own: Float[Array, "n pads"]) -> Prediction:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 import jaxeit as je
 
 from ..presses.streams import robust_deviation
+from .curves.samples import by_rows
 from .fields import Geometry, Places
 from .fields.base import cubic_bspline
 from .fields.geometry import distance, nearest_points
@@ -60,7 +61,7 @@ def _average(
     geometry: Geometry, stage: np.ndarray, image: np.ndarray, use: Bool[np.ndarray, " presses"]
 ) -> tuple[np.ndarray, float]:
     """Average places (presses, 2) of images, and the scatter of a coordinate of single images about them, m."""
-    features, near = np.asarray(_inward(geometry, np.where(use[:, None], stage, 0))), use
+    features, near = by_rows(_inward, np.where(use[:, None], stage, 0), before=(geometry,)), use
     error = np.where(use[:, None], image - stage, 0)
     for _ in range(ROUNDS):
         coefficients = np.linalg.lstsq(features[near].reshape(-1, BUMPS), error[near].ravel(), rcond=None)[0]

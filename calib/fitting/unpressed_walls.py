@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 import jaxeit as je
 
+from .curves.samples import by_rows
 from .fields import FittedField, Geometry, PadEdge, PadEdgeSpline, Places
 from .fields.geometry import onto_pads
 from .fields.pad_edge import wall_distances
@@ -47,7 +48,7 @@ def unpressed_note(field: FittedField | None, places: Places | None, share: Floa
 
 def _wall_distances(geometry: Geometry, places: Places, share: Float[np.ndarray, "n pads"]) -> Float[np.ndarray, " m"]:
     """Distance of each press that rests on one pad to the nearest side of that pad, m."""
-    own = np.asarray(_to_sides(geometry, places.position[:, 0]))[np.nan_to_num(share) >= WHOLE]
+    own = by_rows(_to_sides, places.position[:, 0], before=(geometry,))[np.nan_to_num(share) >= WHOLE]
     found: np.ndarray = own[np.isfinite(own)]
     return found
 

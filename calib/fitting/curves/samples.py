@@ -1,6 +1,6 @@
 """Samples of pressure and force as a fit takes them, made from the arrays of users."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -38,6 +38,18 @@ def bucket(n: int) -> int:
     """The least of the lengths 64, 96, 128, 192, 256, ... that holds n, so that compiled programs are reused."""
     power = 1 << max(n - 1, 63).bit_length()
     return power * 3 // 4 if n <= power * 3 // 4 else power
+
+
+def by_rows(program: Callable[..., Any], *rows: Any, before: tuple[Any, ...] = ()) -> Any:
+    """``program(*before, *rows)`` on the host, of arrays whose rows belong together and whose results do too.
+
+    The last row is repeated up to a `bucket`, so that sessions with other numbers of presses share compiled programs;
+    one row stays alone, as live readings come.
+    """
+    count = len(jax.tree.leaves(rows)[0])
+    index = np.arange(count) if count < 2 else np.minimum(np.arange(bucket(count)), count - 1)
+    wide = jax.device_put(jax.tree.map(lambda part: np.asarray(part)[index], rows))
+    return jax.tree.map(lambda part: np.asarray(part)[:count], program(*before, *wide))
 
 
 def gather(
