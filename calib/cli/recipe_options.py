@@ -82,20 +82,28 @@ def _switch(parser: Any, option: str, text: str) -> None:
     parser.add_argument(option, action=argparse.BooleanOptionalAction, default=None, help=text)
 
 
-def add_imaging_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options for how images are made."""
+def add_imaging_arguments(
+    parser: argparse.ArgumentParser, hyperparameter: str = "0.1", *, with_noise: bool = True
+) -> None:
+    """Options for how images are made.
+
+    Args:
+        hyperparameter: that of images where the option is not given.
+        with_noise: whether the weights of the readings are a choice.
+    """
     group = parser.add_argument_group("images")
     imaging = je.imaging
     _choice(group, "--method", imaging.METHODS, "reconstruction method", default="one-step")
     _choice(group, "--prior", imaging.PRIORS, "prior of the image", default="noser")
     text = "weight of the prior, or a method to choose it, such as noise-figure:0.5"
     names = ("a number", *imaging.HYPERPARAMETERS)
-    _choice(group, "--hyperparameter", names, text, default="0.1")
+    _choice(group, "--hyperparameter", names, text, default=hyperparameter)
     either = group.add_mutually_exclusive_group()
     either.add_argument("--pixels", type=count, metavar="N", help="pixels along x; default: 40")
     _choice(either, "--basis", je.model.BASES, "basis functions of the image", default="pixels")
-    text = "weights of the readings: equal, by their noise at rest, or by the covariance of that noise"
-    _choice(group, "--noise", imaging.NOISES, text, default="equal")
+    if with_noise:
+        text = "weights of the readings: equal, by their noise at rest, or by the covariance of that noise"
+        _choice(group, "--noise", imaging.NOISES, text, default="equal")
 
 
 def _choice(parser: Any, option: str, names: Iterable[str], text: str, default: str, action: str = "store") -> None:
@@ -139,7 +147,7 @@ def imaging_of(args: argparse.Namespace, base: je.Imaging) -> je.Imaging:
         "basis": je.model.BASES.make,
         "noise": je.imaging.NOISES.make,
     }
-    given = {name: _made(args, name, of) for name, of in make.items() if getattr(args, name) is not None}
+    given = {name: _made(args, name, of) for name, of in make.items() if getattr(args, name, None) is not None}
     if args.pixels is not None:
         given["basis"] = je.Pixels(args.pixels)
     try:

@@ -190,6 +190,25 @@ def test_readings_alone_are_read_as_numpy_and_tables_hold_them(bench, tmp_path, 
     assert "--hyperparameter: no hyperparameter 'lcurve'; did you mean 'l-curve'?" in capsys.readouterr().err
 
 
+class Faint(je.Tikhonov):
+    """A prior that a user wrote."""
+
+
+def test_image_takes_the_choices_of_images_and_priors_of_ones_own(bench, tmp_path, capsys):
+    (tmp_path / "tank.toml").write_text(TANK_TOML.replace("eidors-adjacent", "adjacent"))
+    np.save(tmp_path / "frames.npy", bench.frames)
+    files = [str(tmp_path / "frames.npy"), "--skin", str(tmp_path / "tank.toml"), "-o", str(tmp_path / "a.png")]
+    for choices in (["--prior", f"{__name__}:Faint", "--pixels", "12"], ["--basis", "bumps:columns=9", "--method", "greit"]):
+        assert main(["image", *files, *choices]) == 0
+    capsys.readouterr()
+    assert main(["image", *files, "--prior", "laplac"]) == 2
+    assert "--prior: no prior 'laplac'; did you mean 'laplace'?" in capsys.readouterr().err
+    assert main(["image", *files, "--basis", "elements"]) == 2
+    assert "--basis elements: elements make no picture" in capsys.readouterr().err
+    assert main(["image", *files, "--classes", "--prior", "laplace"]) == 2
+    assert "--prior: for images of a change, and --classes chooses its own" in capsys.readouterr().err
+
+
 def test_tables_of_spreadsheets_are_read(bench, tmp_path):
     """Semicolons and decimal commas, quotes, a delimiter at the end, names behind "#" (UTF-16), an empty cell."""
     skin, (vh, vi) = je.skin.parse_skin(TANK_TOML.replace("eidors-adjacent", "adjacent")), bench.frames[:2]

@@ -4,15 +4,17 @@ import argparse
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..arguments import above_zero, picture_kind, prepare_results, require_matplotlib_for, skin_of
+from ..recipe_options import IMAGING, add_imaging_arguments, imaging_of
 from ..terminal import show
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from jaxeit.imaging import AbstractPrior, ReferenceFit, ReferenceSettings
+    from jaxeit import Imaging
+    from jaxeit.imaging import ReferenceFit, ReferenceSettings
 
     from ...tanks import Tank
 
@@ -46,16 +48,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fit-contacts", choices=("one", "each"), help=text)
     text = "with --fit-contacts: also fit an offset of each channel; how large such offsets are, in V"
     parser.add_argument("--fit-offset", type=above_zero, metavar="V", help=text)
-    text = "draw what conducts less and what conducts more than the reference; --prior and --method do not apply"
+    text = "draw what conducts less and what conducts more than the reference; its prior and method are its own"
     parser.add_argument("--classes", action="store_true", help=text)
     text = "the conductivity that --frame alone shows, in S, in place of a change; its prior and method are its own"
     parser.add_argument("--absolute", action="store_true", help=text)
     text = "weigh each change by the reading of the reference, as where instruments err in proportion"
     parser.add_argument("--normalised", action="store_true", help=text)
-    parser.add_argument("--prior", default="noser", help="prior of the image; default: noser")
-    parser.add_argument("--method", default="one-step", help="reconstruction method; default: one-step")
-    text = "weight of the prior, or a method to choose it, such as l-curve; default: 0.3"
-    parser.add_argument("--hyperparameter", default="0.3", metavar="L", help=text)
+    add_imaging_arguments(parser, "0.3", with_noise=False)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -72,15 +71,15 @@ def run(args: argparse.Namespace) -> int:
     from ...session import replacing
 
     kind = picture_kind(args.output)
-    prior, method = je.imaging.PRIORS.make(args.prior), je.imaging.METHODS.make(args.method)
     _require_one_kind(args)
+    imaging = imaging_of(args, je.Imaging(hyperparameter=0.3))
     tank = _tank(args)
     figure = Figure(layout="constrained")  # without a window, on any machine
     axes = figure.subplots()
     if args.absolute:
         lines = _conductivity(args, tank, axes)
     else:
-        lines = _classes(args, tank, axes) if args.classes else _change(args, tank, prior, method, axes)
+        lines = _classes(args, tank, axes) if args.classes else _change(args, tank, imaging, axes)
     je.plot.show_skin(tank.skin, axes)
     compared = "" if args.absolute else f" less {tank.names[args.reference]}"
     axes.set_title(f"{tank.names[args.frame]}{compared}", fontsize=9)
@@ -100,27 +99,23 @@ def _listed(names: tuple[str, ...]) -> str:
     return f"{len(names)} frames: {shown[0]} to {shown[-1]}" if len(names) > 12 else f"frames: {', '.join(shown)}"
 
 
-def _change(args: argparse.Namespace, tank: "Tank", prior: "AbstractPrior", method: Any, axes: "Axes") -> list[str]:
+def _change(args: argparse.Namespace, tank: "Tank", imaging: "Imaging", axes: "Axes") -> list[str]:
     """Draw the difference image; what is printed of it."""
     import jaxeit as je
 
-    from ...calibration.recipe_text import hyperparameter_choice
     from ...tanks import difference_image
 
-    try:
-        weight = hyperparameter_choice(args.hyperparameter, allow_import=True)
-    except ValueError as error:
-        raise ValueError(f"--hyperparameter: {error}") from None
-    choices = {"prior": prior, "method": method, "hyperparameter": weight, "fit": _fit(args)}
-    choices["normalised"] = args.normalised
-    found = difference_image(tank, args.frame, args.reference, **choices)
+    if isinstance(imaging.basis, je.model.Elements):
+        raise ValueError("--basis elements: elements make no picture; give --pixels, or --basis bumps")
+    choices = {name: getattr(imaging, name) for name in ("prior", "method", "basis", "hyperparameter")}
+    found = difference_image(tank, args.frame, args.reference, **choices, normalised=args.normalised, fit=_fit(args))
     je.plot.show_image(found.recon, found.change, axes, label="change of conductivity over the reference's")
     low, high = float(found.change.min()), float(found.change.max())
     of_reference = f"{found.background:.3g} S if it is even; correlation with an even tank {found.correlation:.3f}"
     fitted = [] if found.fit is None else [f"fitted to the reference: {_fitted(found.fit)}"]
     of_image = f"{args.output}: change {low:.2f} to {high:.2f} of the reference's conductivity"
     used = float(found.recon.provenance["hyperparameter"])
-    chosen = [] if isinstance(weight, float) else [f"hyperparameter {used:.3g}"]
+    chosen = [] if isinstance(imaging.hyperparameter, float) else [f"hyperparameter {used:.3g}"]
     return [f"reference: {of_reference}", *fitted, *chosen, of_image]
 
 
@@ -128,8 +123,14 @@ def _require_one_kind(args: argparse.Namespace) -> None:
     """Refuse options that belong to another kind of image."""
     if args.classes and args.absolute:
         raise ValueError("--classes shows a change and --absolute one frame: give one of them")
-    if args.normalised and (args.classes or args.absolute):
-        raise ValueError("--normalised weighs a difference image: leave out --classes and --absolute")
+    if not (args.classes or args.absolute):
+        return
+    kind = "--classes" if args.classes else "--absolute"
+    if args.normalised:
+        raise ValueError(f"--normalised weighs a difference image: leave out {kind}")
+    given = next((name for name in IMAGING if getattr(args, name, None) is not None), None)
+    if given is not None:
+        raise ValueError(f"--{given}: for images of a change, and {kind} chooses its own; leave it out")
 
 
 def _conductivity(args: argparse.Namespace, tank: "Tank", axes: "Axes") -> list[str]:
