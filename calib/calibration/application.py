@@ -43,7 +43,7 @@ def apply(
     loads: float | None = None,
     proposal: ProposalChoice = je.contacts.shipped_proposal,
     load_settings: je.contacts.LoadSettings | None = None,
-    track: bool = False,
+    track: bool | je.tracking.TrackerSettings = False,
     tell: Callable[[str], object] = lambda line: None,
 ) -> Path:
     """Write the force map of every EIT frame of a session; memory does not grow with its length.
@@ -62,7 +62,8 @@ def apply(
             shipped for the skin, and a search where there is none; None: a search.
         load_settings: what is known of loads before a frame; default: the usual. With others, fits begin by a search
             unless a proposal is given, since the shipped ones were trained on the usual loads.
-        track: also follow contacts from frame to frame, each with a number; smoothed over time.
+        track: also follow contacts from frame to frame, each with a number, smoothed over time; by the usual settings
+            or by these.
         tell: called with a line about loads, about contacts, and about each thing outside of what was calibrated.
 
     Raises:
@@ -92,7 +93,8 @@ def apply(
         if loads is not None:
             fit = partial(fit_windows, calibration, progress=progress, proposal=proposed, settings=load_settings)
             also += [_Loads(calibration, writer, loads, fit)]
-        also += [_Tracks(calibration, writer, blocks)] if track else []
+        usual = track if isinstance(track, je.tracking.TrackerSettings) else None
+        also += [_Tracks(calibration, writer, blocks, usual, tell)] if track else []
         for block, found in estimated(calibration, progress(blocks)):
             _append(writer, _of_block(block.time, found, calibration.pads.multiple), kinds)
             for one in also:
@@ -227,13 +229,19 @@ class _Loads:
 class _Tracks:
     """Contacts followed from frame to frame, beside the force maps. The untouched frames are read first."""
 
-    def __init__(self, calibration: Calibration, writer: ArchiveWriter, blocks: FrameBlocks):
+    def __init__(
+        self,
+        calibration: Calibration,
+        writer: ArchiveWriter,
+        blocks: FrameBlocks,
+        settings: je.tracking.TrackerSettings | None,
+        tell: Callable[[str], object],
+    ):
         self._writer, self._why = writer, ""
         self._tracks: ContactTracks | None = None
         try:
-            self._tracks = ContactTracks(
-                quiet_tracker(calibration, blocks), layer=calibration.layer, law=calibration.contact_law
-            )
+            tracker = quiet_tracker(calibration, blocks, settings, tell)
+            self._tracks = ContactTracks(tracker, layer=calibration.layer, law=calibration.contact_law)
         except NotFollowed as error:
             self._why = f"contacts: none followed: {error}"
             return

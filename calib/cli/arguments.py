@@ -4,12 +4,32 @@ import argparse
 import dataclasses
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, TypeVar, overload
 
 if TYPE_CHECKING:
     import jaxeit as je
 
     from ..calibration.localisation.proposals import ProposalChoice
+
+
+T = TypeVar("T")
+
+
+def add_settings_argument(parser: argparse.ArgumentParser, option: str, text: str, example: str) -> None:
+    """An option that gives some settings of an object by their names."""
+    parser.add_argument(option, metavar="NAME=VALUE,...", help=f"{text}, such as {example}")
+
+
+def settings_of_option(args: argparse.Namespace, name: str, kind: type[T]) -> T | None:
+    """The object with the settings of an option; None where the option is not given.
+
+    Raises:
+        ValueError: naming the option, the setting and what to give.
+    """
+    from jaxeit.registry import from_words
+
+    text = getattr(args, name)
+    return None if text is None else from_words(kind, text, "--" + name.replace("_", "-"))
 
 
 def count(text: str) -> int:

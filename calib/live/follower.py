@@ -29,8 +29,13 @@ class LiveFollower:
     then: that takes longer than a frame, and no later frame waits for it.
     """
 
-    def __init__(self, calibration: Calibration, prepare: Prepare = prepare_calibrated_tracker):
-        self._calibration, self._prepare = calibration, prepare
+    def __init__(
+        self,
+        calibration: Calibration,
+        prepare: Prepare = prepare_calibrated_tracker,
+        most: int = TrackerSettings().most,
+    ):
+        self._calibration, self._prepare, self.most = calibration, prepare, most
         self._tracker: Tracker | None = None
         self._now: Tracking | None = None
         self._layer, self.doubt = calibration.layer, noted(calibration.notes)
@@ -41,11 +46,6 @@ class LiveFollower:
     def ready(self) -> bool:
         """Whether the tracker is prepared."""
         return self._tracker is not None
-
-    @property
-    def most(self) -> int:
-        """Largest number of contacts that are followed at once."""
-        return TrackerSettings().most
 
     def prepare(self, resting: np.ndarray) -> None:
         """Prepare the tracker from frames without contact (n, readings) V, and compile its programs.

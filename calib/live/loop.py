@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -19,7 +20,7 @@ import jaxeit as je
 from jaxeit.registry import limited, require_limits
 
 from ..calibration.calibration import Calibration
-from ..calibration.localisation.contact_tracks import NotFollowed
+from ..calibration.localisation.contact_tracks import NotFollowed, prepare_calibrated_tracker
 from ..calibration.localisation.proposals import ProposalChoice, chosen_proposal
 from ..calibration.logs.calibration import LogCalibration
 from ..record.intake import NullSink, RecordSink, explain_silence
@@ -154,7 +155,7 @@ class LiveSettings:
     | event_driven | whether to request readings frame by frame, which the device must support    | False   |      |
     | realtime     | whether to use real-time scheduling once everything is compiled              | False   |      |
     | recalibrate  | whether zero and gains of the pads follow their drift                        | False   |      |
-    | track        | whether contacts are followed from frame to frame                            | False   |      |
+    | track        | whether contacts are followed from frame to frame; or how                    | False   |      |
     | proposal     | network that tells what touches the skin; None: none                         | shipped |      |
     | moved        | calibration file to which the moved calibration is written; None: none       | None    |      |
     """
@@ -164,7 +165,7 @@ class LiveSettings:
     event_driven: bool = False
     realtime: bool = False
     recalibrate: bool = False
-    track: bool = False
+    track: bool | je.tracking.TrackerSettings = False
     proposal: ProposalChoice = je.contacts.shipped_proposal
     moved: str | Path | None = None
 
@@ -229,7 +230,8 @@ def _engine(
         _check_log(calibration, sources, settings)
         return LogEngine(calibration, settings.rest), None
     _check(calibration, sources)
-    follower, recalibrator = LiveFollower(calibration) if settings.track else None, None
+    follower = _follower(calibration, settings.track, control.warn) if settings.track else None
+    recalibrator = None
     if settings.recalibrate:
         layer = None if follower is None else follower.learned
         recalibrator = LiveRecalibrator(calibration, settings.moved, tell=control.warn, layer=layer)
@@ -246,6 +248,15 @@ def _check(calibration: Calibration, sources: Sequence[Source]) -> None:
         raise LiveError(
             f"live: {what}, but this calibration is for {readings} and {pads}; give the calibration of this skin"
         )
+
+
+def _follower(
+    calibration: Calibration, track: bool | je.tracking.TrackerSettings, warn: Callable[[str], object]
+) -> LiveFollower:
+    """What follows contacts, with the usual settings or with these."""
+    settings = track if isinstance(track, je.tracking.TrackerSettings) else je.tracking.TrackerSettings()
+    prepare = partial(prepare_calibrated_tracker, settings=settings, tell=warn)
+    return LiveFollower(calibration, prepare, settings.most)
 
 
 def _check_log(calibration: LogCalibration, sources: Sequence[Source], settings: LiveSettings) -> None:

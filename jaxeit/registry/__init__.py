@@ -18,7 +18,7 @@ Example:
 """
 
 from .limits import AbstractChoice, SettingError, limited, require_limits
-from .registry import Registry, RegistryError, split_word
+from .registry import Registry, RegistryError, from_words, split_word
 from .settings import computed, settings_of
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "RegistryError",
     "SettingError",
     "computed",
+    "from_words",
     "limited",
     "require_limits",
     "settings_of",

@@ -210,6 +210,21 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         return self.name_of(thing) + (":" + ",".join(words) if words else "")
 
 
+def from_words(kind: type[T], text: str, where: str) -> T:
+    """An object of this class with the settings of words such as ``most=5,persistence=1``.
+
+    Args:
+        where: what is named in errors, such as the option of the command line.
+
+    Raises:
+        ValueError: for a setting that does not exist, or a value of the wrong kind.
+
+    Example:
+        settings = je.registry.from_words(je.contacts.ContactSettings, "most=3,columns=41", "--contacts")
+    """
+    return _made(kind, TomlTable(_pairs(text), f"{where} {text}"), {}, ())
+
+
 def kebab_case(name: str) -> str:
     """``TotalVariation`` -> ``total-variation``, ``LCurve`` -> ``l-curve``."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "-", name).lower()
@@ -279,8 +294,13 @@ def split_word(text: str) -> tuple[str, dict[str, Any]]:
     head, _, tail = rest.partition(":")
     if head and "=" not in head:
         name, rest = f"{name}:{head}", tail
-    pairs = [pair.partition("=") for pair in re.split(r",(?![^\[]*\])", rest) if pair.strip()]
-    return name, {key.strip(): _value(value.strip()) for key, _, value in pairs}
+    return name, _pairs(rest)
+
+
+def _pairs(text: str) -> dict[str, Any]:
+    """The values of ``key=value,...`` by their keys."""
+    pairs = [pair.partition("=") for pair in re.split(r",(?![^\[]*\])", text) if pair.strip()]
+    return {key.strip(): _value(value.strip()) for key, _, value in pairs}
 
 
 def _value(text: str) -> Any:

@@ -84,8 +84,11 @@ def test_a_sheet_that_no_coat_explains_is_taken_for_even(skin, monkeypatch):
     monkeypatch.setattr(contact_tracks, "_with_model_error", lambda tracker, _: tracker)
     monkeypatch.setattr(je, "discretise", lambda *_: None)
     calibration = stand_in(Calibration, recon=stand_in(je.Reconstructor, channels=untouched > 0), skin=skin)
+    told = []
     for frame in (untouched, -untouched):
-        contact_tracks.prepare_calibrated_tracker(calibration, frame, untouched)
+        contact_tracks.prepare_calibrated_tracker(calibration, frame, untouched, tell=told.append)
+    assert len(told) == 1
+    assert told[0].startswith("note: the sheet is taken for even, as the untouched frame shows none that fits: no coat")
     np.testing.assert_array_equal(asked[0], untouched)
     np.testing.assert_array_equal(asked[1], -untouched)
     assert asked[2:] == [None]

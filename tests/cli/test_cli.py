@@ -1,5 +1,6 @@
 """The command line: what it prints, how it exits, and one clear line for every wrong input."""
 
+import argparse
 import json
 import re
 import shutil
@@ -7,12 +8,21 @@ import signal
 import socket
 import subprocess
 import sys
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
 
+from calib.calibration import Calibration
 from calib.cli import COMMANDS, main
+from calib.cli.commands import live_command
 from calib.cli.terminal import say
+from calib.presses import Processing
+from calib.session import Session
+from jaxeit.contacts import LoadSettings
+from jaxeit.tracking import TrackerSettings
+
+from ..helpers import stand_in
 
 
 @pytest.fixture(scope="module")
@@ -270,3 +280,38 @@ def test_a_scene_served_as_a_device(presses_file, tmp_path):
             assert serving.wait(20) == 0
         finally:
             serving.kill()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--tracker", "most=0"], "TrackerSettings: most is 0; give at least 1, a whole number"),
+        (["--tracker", "mots=5"], "--tracker mots=5: mots: unknown key; did you mean 'most'?"),
+        (["--tracker", "5"], "--tracker 5: 5: unknown key; known: acceleration"),
+        (["--loads", "1", "--load-settings", "width=12"], "LoadSettings: width is 12 m"),
+        (["--load-settings", "width=0.01"], "--load-settings: it is about fits of loads; add --loads"),
+        (["--loads", "1", "--round-tips", "--load-settings", "width=0.01"], "give one of them"),
+    ],
+)
+def test_settings_of_contacts_that_cannot_be(tmp_path, capsys, words, message):
+    assert main(["apply", "c.h5", "s.h5", "-o", str(tmp_path / "f.h5"), *words]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_settings_of_contacts_reach_apply_and_live(tmp_path, monkeypatch):
+    given = {}
+    calibration = tmp_path / "c.h5"
+    known = stand_in(Calibration, processing=Processing())
+    monkeypatch.setattr("calib.calibration.load_calibration", lambda path: known)
+    monkeypatch.setattr("calib.session.open_session", lambda path: nullcontext(stand_in(Session, stream=lambda *_: [])))
+    monkeypatch.setattr("calib.calibration.apply", lambda *_, **options: given.update(options))
+    words = ["--tracker", "most=5", "--loads", "1", "--load-settings", "width=0.01,coat=0.1"]
+    assert main(["apply", str(calibration), "s.h5", "-o", str(tmp_path / "f.h5"), *words]) == 0
+    assert given["track"] == TrackerSettings(most=5)
+    assert given["load_settings"] == LoadSettings(width=0.01, coat=0.1)
+    parser = argparse.ArgumentParser()
+    live_command.add_arguments(parser)
+    live = ["--calibration", "c.h5", "--pressure", "p"]
+    follow = {(): False, ("--track",): True, ("--tracker", "most=4"): TrackerSettings(most=4)}
+    for more, track in follow.items():
+        assert live_command._settings(parser.parse_args([*live, *more])).track == track

@@ -13,11 +13,21 @@ import numpy as np
 from jaxtyping import Float, Int
 
 import jaxeit as je
-from jaxeit.tracking import ContactLaw, LearnedLayer, Smoother, TimedTracks, Track, Tracker, Tracking
+from jaxeit.tracking import (
+    ContactLaw,
+    LearnedLayer,
+    Smoother,
+    TimedTracks,
+    Track,
+    Tracker,
+    TrackerSettings,
+    Tracking,
+)
 
 from ..calibration import Calibration
 from ..frame_blocks import FrameBlocks
 from .load_windows import FIDELITY
+from .press_images import taken_for_even
 from .quiet_frames import ENOUGH, QuietFrames
 
 MIN_SECONDS = 1e-4  # between frames; those that arrive together bear about the same time
@@ -35,7 +45,11 @@ class NotFollowed(ValueError):
 
 
 def prepare_calibrated_tracker(
-    calibration: Calibration, untouched: Float[np.ndarray, " readings"], noise: Float[np.ndarray, " readings"] | None
+    calibration: Calibration,
+    untouched: Float[np.ndarray, " readings"],
+    noise: Float[np.ndarray, " readings"] | None,
+    settings: TrackerSettings | None = None,
+    tell: Callable[[str], object] = lambda line: None,
 ) -> Tracker:
     """A tracker of the calibrated skin, whose model errs by as much as presses of the calibration show.
 
@@ -43,6 +57,8 @@ def prepare_calibrated_tracker(
         untouched: mean frame without contact, V.
         noise: standard deviation of the readings of a frame, V; readings without noise are left out. The frame as a
             whole may also drift by `GAIN_DRIFT`.
+        settings: of the tracker; default: the usual.
+        tell: called with a line if no sheet fits the untouched frame.
 
     Raises:
         NotFollowed: if the noise is not known, or the presses of the calibration do not tell the model error.
@@ -54,10 +70,11 @@ def prepare_calibrated_tracker(
         raise NotFollowed("no reading has noise without contact, so none tells how sure it is")
     model = je.discretise(je.Scene(calibration.skin), FIDELITY)
     errors = _covariance(np.where(channels, noise, 1.0), np.where(channels, untouched, 0.0))
-    prepare = partial(je.tracking.prepare_tracker, model, calibration.skin, noise=errors, channels=channels)
+    prepare = partial(je.tracking.prepare_tracker, model, calibration.skin, settings, noise=errors, channels=channels)
     try:
         tracker = prepare(untouched=untouched)
-    except je.imaging.InverseError:  # no sheet fits the untouched frame, which is taken for even
+    except je.imaging.InverseError as error:
+        tell(f"note: {taken_for_even(error)}")
         tracker = prepare()
     return _with_model_error(tracker, calibration)
 
@@ -79,8 +96,16 @@ def _with_model_error(tracker: Tracker, calibration: Calibration) -> Tracker:
         raise NotFollowed(f"the presses of the calibration do not tell how far the model errs: {error}") from error
 
 
-def quiet_tracker(calibration: Calibration, blocks: FrameBlocks) -> Tracker:
+def quiet_tracker(
+    calibration: Calibration,
+    blocks: FrameBlocks,
+    settings: TrackerSettings | None = None,
+    tell: Callable[[str], object] = lambda line: None,
+) -> Tracker:
     """A tracker with the untouched sheet and the noise of the first frames without contact.
+
+    Args:
+        settings, tell: as for `prepare_calibrated_tracker`.
 
     Raises:
         NotFollowed: if there are none.
@@ -90,7 +115,7 @@ def quiet_tracker(calibration: Calibration, blocks: FrameBlocks) -> Tracker:
         quiet.add(block.frames, block.change, block.loaded(calibration))
         if quiet.count >= ENOUGH:
             break
-    return prepare_calibrated_tracker(calibration, quiet.untouched, quiet.noise)
+    return prepare_calibrated_tracker(calibration, quiet.untouched, quiet.noise, settings, tell)
 
 
 def probe_presses(calibration: Calibration) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:

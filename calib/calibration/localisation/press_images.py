@@ -92,4 +92,9 @@ def fit_untouched_sheet(
     try:
         return je.fit_background(model, np.where(channels, untouched, np.nan)), ()
     except je.imaging.InverseError as error:
-        return None, (f"the sheet is taken for even, as the untouched frame shows none that fits: {error}",)
+        return None, (taken_for_even(error),)
+
+
+def taken_for_even(error: je.imaging.InverseError) -> str:
+    """What is said where no conductivity of the sheet fits the untouched frame."""
+    return f"the sheet is taken for even, as the untouched frame shows none that fits: {error}"

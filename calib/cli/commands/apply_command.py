@@ -7,9 +7,11 @@ from ..arguments import (
     NO_PROPOSAL,
     above_zero,
     add_proposal_argument,
+    add_settings_argument,
     prepare_results,
     proposal_of,
     require_matplotlib_for,
+    settings_of_option,
 )
 from ..recipe_options import add_correction_arguments, processing_of, refuse_corrections
 from ..terminal import progress_bar, show
@@ -32,8 +34,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "with --loads: only round tips touch the skin; two are told apart at smaller distances, and nothing is an edge"
     )
     parser.add_argument("--round-tips", action="store_true", help=text)
+    text = "with --loads: what is known of loads, settings of jaxeit.contacts.LoadSettings"
+    add_settings_argument(parser, "--load-settings", text, "width=0.008")
     text = "also follow contacts from frame to frame: number, place with covariance, force, smoothed over time"
     parser.add_argument("--track", action="store_true", help=text)
+    add_settings_argument(parser, "--tracker", "as --track, with settings of jaxeit.tracking.TrackerSettings", "most=5")
     text = (
         "write an HTML report: paths and forces of the contacts that are followed (--track), probabilities of --loads"
     )
@@ -47,11 +52,14 @@ def run(args: argparse.Namespace) -> int:
 
     set_up()
     from jaxeit.contacts import LoadSettings
+    from jaxeit.tracking import TrackerSettings
 
     from ...calibration import LogCalibration, apply, load_calibration
     from ...session import open_session
 
     _check_options(args)
+    tracker = settings_of_option(args, "tracker", TrackerSettings)
+    known = settings_of_option(args, "load_settings", LoadSettings)
     prepare_results(args, "output", "report")
     calibration = load_calibration(args.calibration)
     if isinstance(calibration, LogCalibration):
@@ -66,8 +74,8 @@ def run(args: argparse.Namespace) -> int:
             progress=progress_bar("frames"),
             loads=args.loads,
             proposal=proposal_of(args.proposal),
-            load_settings=LoadSettings.round_tips() if args.round_tips else None,
-            track=args.track,
+            load_settings=LoadSettings.round_tips() if args.round_tips else known,
+            track=args.track if tracker is None else tracker,
             tell=show,
         )
         frames = len(session.stream("eit"))
@@ -84,12 +92,20 @@ def _check_options(args: argparse.Namespace) -> None:
         raise ValueError("--proposal: it is where fits of loads begin; add --loads SECONDS")
     if args.round_tips and args.loads is None:
         raise ValueError("--round-tips: it is about fits of loads; add --loads SECONDS")
+    if args.load_settings is not None and args.loads is None:
+        raise ValueError("--load-settings: it is about fits of loads; add --loads SECONDS")
+    if args.load_settings is not None and args.round_tips:
+        raise ValueError("--load-settings and --round-tips both say what is known of loads; give one of them")
     if args.round_tips and args.proposal not in (None, NO_PROPOSAL):
         raise ValueError("--round-tips: a proposal was trained on tips of all shapes; leave out one of the two")
     if args.report is not None:
-        if not args.track and args.loads is None:
+        if not _follows(args) and args.loads is None:
             raise ValueError("--report: it is about contacts; add --track, which follows them, or --loads SECONDS")
         require_matplotlib_for("--report")
+
+
+def _follows(args: argparse.Namespace) -> bool:
+    return args.track or args.tracker is not None
 
 
 def _run_log(args: argparse.Namespace, calibration: "LogCalibration") -> int:
@@ -97,8 +113,8 @@ def _run_log(args: argparse.Namespace, calibration: "LogCalibration") -> int:
     from ...session import open_session
 
     refuse_corrections(args)
-    if args.loads is not None or args.track:
-        option = "--track" if args.track else "--loads"
+    if args.loads is not None or _follows(args):
+        option = "--loads" if args.loads is not None else "--tracker" if args.tracker is not None else "--track"
         raise ValueError(f"{option}: the calibration of a log has no EIT, which tells where contacts are")
     with open_session(args.session) as session:
         found = apply_log(calibration, session, args.output, ignore_errors=args.force)
