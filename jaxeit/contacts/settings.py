@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from ..imaging.noise import InverseError
+from ..registry import limited, require_limits
+from ..registry.limits import LONGEST
 
 
 @dataclass(frozen=True)
@@ -27,23 +27,15 @@ class ContactSettings:
         InverseError: for a value out of range.
     """
 
-    most: int = 3
-    widths: tuple[float, float] = (0.005, 0.03)
-    columns: int = 41
-    false_alarm: float = 0.01
-    model_error: float = 0.015
-    ratio: float = 0.8
-    separation: float = 1.2
+    most: int = limited(3, least=1)
+    widths: tuple[float, float] = limited((0.005, 0.03), above=0, most=LONGEST, unit="m", size=2)
+    columns: int = limited(41, least=5, most=500)
+    false_alarm: float = limited(0.01, above=0, below=0.5)
+    model_error: float = limited(0.015, least=0, below=1)
+    ratio: float = limited(0.8, least=0)
+    separation: float = limited(1.2, least=0)
 
     def __post_init__(self) -> None:
-        for name, fine, wanted in (
-            ("most", self.most >= 1, "one or more"),
-            ("widths", 0 < self.widths[0] < self.widths[1] < np.inf, "smallest and largest, m"),
-            ("columns", 5 <= self.columns <= 500, "5 to 500"),
-            ("false_alarm", 0 < self.false_alarm < 0.5, "above 0 and below 0.5"),
-            ("model_error", 0 <= self.model_error < 1, "0 or more, below 1"),
-            ("ratio", 0 <= self.ratio < np.inf, "0 or more"),
-            ("separation", 0 <= self.separation < np.inf, "0 or more"),
-        ):
-            if not fine:
-                raise InverseError(f"{name} is {getattr(self, name)}; give {wanted}")
+        require_limits(self, InverseError)
+        if not self.widths[0] < self.widths[1]:
+            raise InverseError(f"ContactSettings: widths is {self.widths}; give the smallest, then the largest, m")

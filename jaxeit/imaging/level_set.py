@@ -15,10 +15,11 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 
 from .._compile import verb
+from ..kinds import require_kind
 from ..least_squares import quadratic
 from ..least_squares.searches import HalfSquares
 from ..model.bases import Picture
-from .absolute.frames import require_positive
+from ..registry import limited, require_limits
 from .absolute.images import IMAGE_STEPS, IMAGE_TOLERANCE, AbstractPosterior, ImagePosterior, Quadratic, most_probable
 from .noise import InverseError
 from .priors import AbstractPrior, Laplace
@@ -38,14 +39,22 @@ class LevelSet(eqx.Module):
     | widths of the border, of one fit after the other                               | 0.5, 0.25      | pixels |
     | height of a piece: absolute logarithm of conductivity over the reference's     | 2              |        |
     | height_std: of the height, before the frame is seen                            | 0.1            |        |
+
+    Raises:
+        InverseError: for a value out of range.
     """
 
     prior: AbstractPrior = Laplace(3e-3)
-    weight: float = eqx.field(static=True, default=1e-4)
-    outside: float = eqx.field(static=True, default=-2.0)
-    widths: tuple[float, ...] = eqx.field(static=True, default=(0.5, 0.25))
-    height: float = eqx.field(static=True, default=2.0)
-    height_std: float = eqx.field(static=True, default=0.1)
+    weight: float = limited(1e-4, above=0, static=True)
+    outside: float = limited(-2.0, static=True)
+    widths: tuple[float, ...] = limited((0.5, 0.25), above=0, static=True)
+    height: float = limited(2.0, above=0, static=True)
+    height_std: float = limited(0.1, above=0, static=True)
+
+    def __check_init__(self) -> None:
+        an_object = "an object, such as je.Laplace(3e-3)"
+        require_kind(self.prior, AbstractPrior, InverseError, "a prior", an_object, "LevelSet")
+        require_limits(self, InverseError)
 
 
 class Distances(NamedTuple):
@@ -85,11 +94,7 @@ def fitted_level(
 
     Args:
         readings: number of them that are used.
-
-    Raises:
-        InverseError: if a setting is not above zero.
     """
-    _require_usable(settings)
     picture = posterior.physics.image.picture
     shapes = zip(picture.shape, start.level.shape, strict=True)
     places = np.ix_(*(((np.arange(n) + 0.5) / n * fine).astype(int) for n, fine in shapes))
@@ -112,14 +117,6 @@ def fitted_level(
 @verb
 def _residual(posterior: AbstractPosterior, x: Float[Array, " n"]) -> Float[Array, " m"]:
     return posterior.residual(x)
-
-
-def _require_usable(settings: LevelSet) -> None:
-    require_positive(weight=settings.weight, height=settings.height, height_std=settings.height_std)
-    for width in settings.widths:
-        require_positive(width=width)
-    if not settings.widths:
-        raise InverseError("widths is empty; give the width of the border, such as widths=(0.5, 0.25)")
 
 
 class _LevelPosterior(AbstractPosterior):

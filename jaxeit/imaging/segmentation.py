@@ -17,11 +17,13 @@ from jaxtyping import Array, Bool, DTypeLike, Float, Int, Shaped
 from scipy.ndimage import distance_transform_edt, label, map_coordinates
 
 from .._compile import require_known
+from ..kinds import require_kind
 from ..model.bases import AbstractBasis, AbstractPictured, BasisMap, Picture
 from ..model.discretisation import Model, require_model
 from ..model.forward_model import forward
 from ..model.metal_sheet import containing_triangles
-from .absolute.frames import checked_frame, require_positive
+from ..registry import limited, require_limits
+from .absolute.frames import checked_frame
 from .absolute.images import (
     AbstractPenalty,
     ImagePosterior,
@@ -47,12 +49,18 @@ class ChangeErrors(eqx.Module):
     The absolute error grows where the image leaves more of the frame than that. Frames that repeat better than 0.3 %
     allow a smaller one.
 
+    Raises:
+        InverseError: for a value out of range.
+
     Example:
         print(je.imaging.ChangeErrors(absolute=0.001))  # of frames that repeat well
     """
 
-    relative: float = eqx.field(static=True, default=0.03)
-    absolute: float = eqx.field(static=True, default=0.003)
+    relative: float = limited(0.03, above=0, static=True)
+    absolute: float = limited(0.003, above=0, static=True)
+
+    def __check_init__(self) -> None:
+        require_limits(self, InverseError)
 
 
 class RegionSettings(eqx.Module):
@@ -65,14 +73,20 @@ class RegionSettings(eqx.Module):
     | weakest: sum of the image over the weakest region, over that of the strongest      | 0.18    |
     | pixels of the classes along each axis                                              | 256     |
 
+    Raises:
+        InverseError: for a value out of range.
+
     Example:
         print(je.imaging.RegionSettings(floor=0.2, pixels=128))  # also faint regions
     """
 
-    floor: float = eqx.field(static=True, default=0.5)
-    least: float = eqx.field(static=True, default=2.28e-3)
-    weakest: float = eqx.field(static=True, default=0.18)
-    pixels: int = eqx.field(static=True, default=256)
+    floor: float = limited(0.5, above=0, static=True)
+    least: float = limited(2.28e-3, above=0, static=True)
+    weakest: float = limited(0.18, above=0, static=True)
+    pixels: int = limited(256, least=1, static=True)
+
+    def __check_init__(self) -> None:
+        require_limits(self, InverseError)
 
 
 class Segmentation(eqx.Module):
@@ -151,8 +165,10 @@ def segment(
     require_model(model)
     require_known("segment", InverseError, model.background)
     seen = _seen(model, reference, frame, missed)
-    require_positive(**{f"errors.{name}": value for name, value in vars(errors).items()})
-    require_positive(**{f"regions.{name}": value for name, value in vars(regions).items()})
+    require_kind(errors, ChangeErrors, InverseError, "an error of changes", "errors=ChangeErrors(...)")
+    require_kind(regions, RegionSettings, InverseError, "a setting of regions", "regions=RegionSettings(...)")
+    if borders is not None:
+        require_kind(borders, LevelSet, InverseError, "a setting of borders", "borders=LevelSet(...), or None")
     image = picture_basis(model, basis)
     penalty = variation_of(seen.used(model.dtype)) if penalty is None else penalty
     physics = LogConductivity(model, image, model.mean_background)

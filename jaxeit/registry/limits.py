@@ -13,6 +13,9 @@ NO_NUMBERS = "SUOMmc"
 """Kinds of arrays of texts, objects, dates and complex numbers."""
 
 
+ONE_NUMBER = (int, float, int | None, float | None)
+"""Annotations of fields that hold one number."""
+
 LONGEST = 1.0
 """Largest length among settings, m: longer than any skin, and below what a length in mm would be."""
 
@@ -32,6 +35,8 @@ class Limits(NamedTuple):
     | whole: whether fractions are refused          |
     | unit: of the numbers, for messages            |
     | empty: whether there may be no number at all  |
+    | open_end: whether the largest is refused      |
+    | size: how many numbers there are; None: any   |
     """
 
     least: float = -math.inf
@@ -41,21 +46,29 @@ class Limits(NamedTuple):
     whole: bool = False
     unit: str = ""
     empty: bool = False
+    open_end: bool = False
+    size: int | None = None
 
     def outside(self, value: Any) -> np.ndarray:
         """The numbers of a value, an array or a scalar, that have no meaning; all of what holds no real numbers."""
-        numbers = np.atleast_1d(np.asarray(value))
+        try:
+            numbers = np.atleast_1d(np.asarray(value))
+        except ValueError:  # rows of unequal lengths
+            return np.array([str(value)])
         if numbers.dtype.kind in NO_NUMBERS:
             return numbers
         low = numbers > self.least if self.open else numbers >= self.least
         kind = (np.isfinite(numbers) | (not self.finite)) & ((numbers.dtype.kind in "iu") | (not self.whole))
-        found: np.ndarray = numbers[~(low & (numbers <= self.most) & kind)]
+        high = numbers < self.most if self.open_end else numbers <= self.most
+        found: np.ndarray = numbers[~(low & high & kind)]
         return found
 
     def __str__(self) -> str:
-        kind = f"{self.unit and ' '}{self.unit}{', a whole number' if self.whole else ''}"
+        several = "" if self.size is None else f", {self.size} numbers"
+        kind = f"{self.unit and ' '}{self.unit}{', a whole number' if self.whole else ''}{several}"
         if math.isfinite(self.most):
-            return f"{'more than ' if self.open else ''}{self.least:g} to {self.most:g}{kind}"
+            end = f"{'less than ' if self.open_end else ''}{self.most:g}"
+            return f"{'more than ' if self.open else ''}{self.least:g} to {end}{kind}"
         if math.isfinite(self.least):
             return f"{'more than' if self.open else 'at least'} {self.least:g}{kind}"
         return "a finite number" if self.finite else "a number"
@@ -67,19 +80,22 @@ def limited(
     least: float = -math.inf,
     above: float | None = None,
     most: float = math.inf,
+    below: float | None = None,
     finite: bool = True,
     whole: bool | None = None,
     unit: str = "",
     empty: bool = False,
+    size: int | None = None,
     **options: Any,
 ) -> Any:
-    """A field of a class whose numbers lie from ``least``, or ``above`` a number, to ``most``.
+    """A field of a class whose numbers lie from ``least``, or ``above`` a number, to ``most``, or ``below`` a number.
 
     Args:
         finite: whether infinite numbers are refused.
         whole: whether fractions are refused; by default where the default is a whole number.
         unit: of the numbers, for messages.
         empty: whether there may be no number at all.
+        size: how many numbers there are; default: any, and one where the annotation is ``int`` or ``float``.
         options: of `equinox.field`, such as ``static`` and ``converter``.
 
     Example:
@@ -96,7 +112,8 @@ def limited(
             print(error)
     """
     whole = type(default) is int if whole is None else whole
-    limits = Limits(least if above is None else above, most, above is not None, finite, whole, unit, empty)
+    ends = least if above is None else above, most if below is None else below
+    limits = Limits(*ends, above is not None, finite, whole, unit, empty, below is not None, size)
     return eqx.field(default=default, metadata={"limits": limits}, **options)
 
 
@@ -127,6 +144,10 @@ def require_limits(thing: Any, error: type[ValueError] = SettingError) -> None:
             raise error(f"{type(thing).__name__}: {field.name} is empty; give {limits}")
         if (wrong := limits.outside(value)).size:
             raise error(f"{type(thing).__name__}: {field.name} is {_shown(wrong, limits)}; give {limits}")
+        if np.ndim(value) and field.type in ONE_NUMBER:
+            raise error(f"{type(thing).__name__}: {field.name} has shape {np.shape(value)}; give one number, {limits}")
+        if limits.size is not None and np.shape(value) != (limits.size,):
+            raise error(f"{type(thing).__name__}: {field.name} has shape {np.shape(value)}; give {limits}")
 
 
 def _shown(wrong: np.ndarray, limits: Limits) -> str:

@@ -3,16 +3,17 @@
 from dataclasses import dataclass, field
 from functools import partial
 
-import numpy as np
-
 from ..contacts.loads import LoadSettings
 from ..imaging.noise import InverseError
+from ..kinds import require_kind
 from ..model.fidelity import Fidelity
+from ..registry import limited, require_limits
 
 # Moments of the shapes of tips, as `pressure.shape_directions` counts them; ellipses depend on them, and no decision.
 # Of a flat tip, a ring and a tilted tip, 36 mm wide, which the pad spreads by 6 mm, those in L2 and L3 are 0.1 to 0.3,
 # and the others 0.12 or less.
 SHAPE = 0.15
+PRECISIONS = ("float32", "float64")
 
 
 @dataclass(frozen=True)
@@ -42,30 +43,28 @@ class TrackerSettings:
     """
 
     loads: LoadSettings = field(default_factory=partial(LoadSettings, shape=SHAPE))
-    level: float = 0.3
-    tail: float = 0.3
-    persistence: float = 0.5
-    acceleration: float = 0.3
-    width_rate: float = 0.5
-    force_rate: float = 5.0
-    gain_rate: float = 0.1
-    birth_rate: float = 0.5
-    most: int = 3
-    unknowns: int = 96
-    modes: int = 24
-    columns: int | None = None
-    pixels: int = 400
+    level: float = limited(0.3, above=0)
+    tail: float = limited(0.3, least=0)
+    persistence: float = limited(0.5, above=0, unit="s")
+    acceleration: float = limited(0.3, above=0)
+    width_rate: float = limited(0.5, above=0)
+    force_rate: float = limited(5.0, above=0)
+    gain_rate: float = limited(0.1, least=0)
+    birth_rate: float = limited(0.5, above=0)
+    most: int = limited(3, least=1)
+    unknowns: int = limited(96, least=1)
+    modes: int = limited(24, least=1)
+    columns: int | None = limited(None, least=1, whole=True)
+    pixels: int = limited(400, least=1)
     fidelity: Fidelity = field(default_factory=Fidelity.draft)
     dtype: str = "float32"
 
     def __post_init__(self) -> None:
-        for name in ("level", "persistence", "acceleration", "width_rate", "force_rate", "birth_rate"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise InverseError(f"{name} is {getattr(self, name)}; give a number above zero")
-        for name in ("tail", "gain_rate"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise InverseError(f"{name} is {getattr(self, name)}; give zero or a number above it")
-        for name in ("most", "unknowns", "modes", "columns", "pixels"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise InverseError(f"{name} is {value}; give one or more")
+        where = "TrackerSettings"
+        loads = "an object, such as je.contacts.LoadSettings()"
+        require_kind(self.loads, LoadSettings, InverseError, "what is known of loads", loads, where)
+        fidelity = "an object, such as je.Fidelity.draft()"
+        require_kind(self.fidelity, Fidelity, InverseError, "a fidelity", fidelity, where)
+        require_limits(self, InverseError)
+        if self.dtype not in PRECISIONS:
+            raise InverseError(f"TrackerSettings: dtype is {self.dtype!r}; give {' or '.join(map(repr, PRECISIONS))}")

@@ -4,6 +4,7 @@ import dataclasses
 import math
 import re
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
@@ -49,23 +50,66 @@ def test_every_number_that_text_can_give_has_limits(case):
             registry.make(f"{name}:{setting.name}={[given] * 3 if listed else given}")
 
 
-SETTINGS = [
-    je.LevelCentroid,
-    je.imaging.ElectrodeFitSettings,
-    calib.presses.DetectionLimits,
-    calib.presses.WindowLengths,
-    calib.calibration.FittedContact,
-]
+SETTINGS = {
+    je.LevelCentroid: SettingError,
+    je.imaging.ElectrodeFitSettings: SettingError,
+    calib.presses.DetectionLimits: SettingError,
+    calib.presses.WindowLengths: SettingError,
+    calib.calibration.FittedContact: SettingError,
+    je.contacts.ContactSettings: je.imaging.InverseError,
+    je.contacts.LoadSettings: je.imaging.InverseError,
+    je.tracking.TrackerSettings: je.imaging.InverseError,
+    je.imaging.ReferenceSettings: je.imaging.InverseError,
+    je.imaging.LevelSet: je.imaging.InverseError,
+    je.imaging.ChangeErrors: je.imaging.InverseError,
+    je.imaging.RegionSettings: je.imaging.InverseError,
+}
+"""Classes of settings, and the error that each raises."""
+OTHERS = {"outside", "loads", "fidelity", "dtype", "law", "forces", "prior"}
+"""Settings that are no number, or may be below zero."""
 
 
 @pytest.mark.parametrize(
-    ("kind", "name"), [(kind, f.name) for kind in SETTINGS for f in dataclasses.fields(kind)], ids=str
+    ("kind", "name"),
+    [(kind, f.name) for kind in SETTINGS for f in dataclasses.fields(kind) if f.name not in OTHERS],
+    ids=str,
 )
 def test_every_number_of_these_settings_has_limits(kind, name):
-    for wrong in (-1,) if type(getattr(kind(), name)) is int else (-1.0, math.nan):
-        value = (wrong, wrong) if isinstance(getattr(kind(), name), tuple) else wrong
-        with pytest.raises(SettingError, match=f"{kind.__name__}: {name} is {wrong:g}; give "):
+    usual = getattr(kind(), name)
+    counts = type(usual) is int or name == "columns"
+    for wrong in (-1,) if counts else (-1.0, math.nan):
+        value = (wrong, wrong) if isinstance(usual, tuple) else wrong
+        with pytest.raises(SETTINGS[kind], match=f"{kind.__name__}: {name} is {wrong:g}( m| s| N| V)?; give "):
             kind(**{name: value})
+    if issubclass(kind, eqx.Module):
+        return  # tests check its annotations before its limits
+    for wrong in ("0.01", *((2.5, True) if counts else ())):
+        with pytest.raises(SETTINGS[kind], match=f"{kind.__name__}: {name} is {wrong!r}( m| s| N| V)?; give "):
+            kind(**{name: wrong})
+    if not isinstance(usual, tuple):
+        with pytest.raises(SETTINGS[kind], match=rf"{kind.__name__}: {name} has shape \(2,\); give one number"):
+            kind(**{name: jnp.full(2, usual or 1)})
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "said"),
+    [
+        (je.contacts.ContactSettings, {"widths": (0.01,)}, r"widths has shape \(1,\); give .* m, 2 numbers"),
+        (je.contacts.ContactSettings, {"widths": (5.0, 30.0)}, "widths is 5 m; give more than 0 to 1 m"),
+        (je.contacts.ContactSettings, {"false_alarm": 0.5}, "false_alarm is 0.5; give more than 0 to less than 0.5"),
+        (je.contacts.LoadSettings, {"width": 12.0}, "width is 12 m; give more than 0 to 1 m"),
+        (je.contacts.LoadSettings, {"prior": (0.5, 0.5)}, r"prior has shape \(2,\)"),
+        (je.contacts.LoadSettings, {"law": "hill"}, "'hill' is not a law of pressure"),
+        (je.tracking.TrackerSettings, {"dtype": "foo"}, "dtype is 'foo'; give 'float32' or 'float64'"),
+        (je.tracking.TrackerSettings, {"loads": 3}, "int is not what is known of loads"),
+        (je.tracking.TrackerSettings, {"fidelity": "draft"}, "'draft' is not a fidelity"),
+        (je.imaging.ReferenceSettings, {"shift": 2.0}, "shift is 2 m; give 0 to 1 m"),
+        (je.imaging.LevelSet, {"widths": ()}, "widths is empty"),
+    ],
+)
+def test_settings_of_other_sizes_and_kinds_are_refused(kind, given, said):
+    with pytest.raises(je.imaging.InverseError, match=f"{kind.__name__}: {said}"):
+        kind(**given)
 
 
 def test_no_number_that_is_not_finite_and_no_fraction_of_a_count():

@@ -8,11 +8,11 @@ import numpy as np
 from ...effects import EFFECTS, ContactPiezoresistance
 from ...imaging.absolute.background import COATING_LENGTH, COATING_STD
 from ...imaging.noise import InverseError
+from ...kinds import require_kind
+from ...registry import limited, require_limits
+from ...registry.limits import LONGEST
 
-POSITIVE = (
-    *("gain_length", "texture_length", "coat_length", "width", "width_spread", "force", "force_spread"),
-    *("width_difference", "force_difference", "length", "nearest", "shortest"),
-)
+KINDS = 5  # of `LoadKind`
 NO_EDGE = (0.25, 0.25, 0.25, 0.0, 0.25)
 
 
@@ -50,6 +50,10 @@ class ForceLaw:
             f"amplitude times {amplitude}, half_pressure times {half_pressure}, exponent times {exponent}, "
             f"variance times {self.variance:.2g}"
         )
+
+
+def _length(default: float) -> Any:
+    return limited(default, above=0, most=LONGEST, unit="m")
 
 
 @dataclass(frozen=True)
@@ -94,37 +98,33 @@ class LoadSettings:
 
     law: ContactPiezoresistance = field(default_factory=ContactPiezoresistance)
     forces: ForceLaw = ForceLaw()
-    gain: float = 0.12
-    gain_length: float = 0.015
-    texture: float = 0.0
-    texture_length: float = 0.0075
-    coat: float | None = None
-    coat_length: float = COATING_LENGTH
-    shape: float = 0.1
-    shapes: tuple[float, ...] = (0.0, 1.0, 2.0, 4.0, 8.0)
-    model_error: float = 0.005
-    width: float = 0.012
-    width_spread: float = 0.4
-    force: float = 8.0
-    force_spread: float = 1.2
-    width_difference: float = 0.2
-    force_difference: float = 0.8
-    length: float = 0.02
-    nearest: float = 0.018
-    shortest: float = 0.024
-    prior: tuple[float, float, float, float, float] = (0.2, 0.2, 0.2, 0.2, 0.2)
+    gain: float = limited(0.12, least=0)
+    gain_length: float = _length(0.015)
+    texture: float = limited(0.0, least=0)
+    texture_length: float = _length(0.0075)
+    coat: float | None = limited(None, least=0)
+    coat_length: float = _length(COATING_LENGTH)
+    shape: float = limited(0.1, least=0)
+    shapes: tuple[float, ...] = limited((0.0, 1.0, 2.0, 4.0, 8.0), least=0)
+    model_error: float = limited(0.005, least=0)
+    width: float = _length(0.012)
+    width_spread: float = limited(0.4, above=0)
+    force: float = limited(8.0, above=0, unit="N")
+    force_spread: float = limited(1.2, above=0)
+    width_difference: float = limited(0.2, above=0)
+    force_difference: float = limited(0.8, above=0)
+    length: float = _length(0.02)
+    nearest: float = _length(0.018)
+    shortest: float = _length(0.024)
+    prior: tuple[float, float, float, float, float] = limited((0.2, 0.2, 0.2, 0.2, 0.2), least=0, size=KINDS)
 
     def __post_init__(self) -> None:
-        for name in POSITIVE:
-            if not 0 < getattr(self, name) < np.inf:
-                raise InverseError(f"{name} is {getattr(self, name)}; give a number above zero")
-        for name in ("gain", "texture", "coat", "shape", "model_error"):
-            if getattr(self, name) is not None and not 0 <= getattr(self, name) < np.inf:
-                raise InverseError(f"{name} is {getattr(self, name)}; give 0 or more")
-        if not (len(self.shapes) and min(self.shapes) >= 0 and max(self.shapes) < np.inf):
-            raise InverseError(f"shapes is {self.shapes}; give numbers of at least 0")
-        if len(self.prior) != 5 or min(self.prior) < 0 or not np.isclose(sum(self.prior), 1):
-            raise InverseError(f"prior is {self.prior}; give five probabilities whose sum is 1")
+        where, an_object = "LoadSettings", "an object, such as je.effects.ContactPiezoresistance()"
+        require_kind(self.law, ContactPiezoresistance, InverseError, "a law of pressure", an_object, where)
+        require_kind(self.forces, ForceLaw, InverseError, "a law of forces", "that of learn_loads", where)
+        require_limits(self, InverseError)
+        if not np.isclose(sum(self.prior), 1):
+            raise InverseError(f"LoadSettings: prior is {self.prior}; give {KINDS} probabilities whose sum is 1")
 
     @classmethod
     def round_tips(cls, **others: Any) -> "LoadSettings":

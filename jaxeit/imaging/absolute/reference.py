@@ -29,6 +29,8 @@ from ...linalg.lapack import eigh
 from ...model.discretisation import Model, require_model
 from ...model.forward_model import forward
 from ...model.motion import Motion, electrode_motion, moved
+from ...registry import limited, require_limits
+from ...registry.limits import LONGEST
 from ..noise import ConvergenceError, InverseError
 from .frames import MAX_UNEXPLAINED, checked_errors, checked_frame, frame_error, require_explained, sheet_level
 from .images import reading_weights
@@ -60,19 +62,17 @@ class ReferenceSettings(eqx.Module):
     With ``scale`` zero the mesh is taken as exact, in the errors of contacts too.
     """
 
-    level: float = 3.0
-    contact: float = 3.0
-    contact_each: float = 1.0
-    gain: float = 0.0
-    offset: float = 0.0
-    shift: float = 0.0
-    common_mode: float = 0.0
-    scale: float = MODEL_ERROR
+    level: float = limited(3.0, least=0)
+    contact: float = limited(3.0, least=0)
+    contact_each: float = limited(1.0, least=0)
+    gain: float = limited(0.0, least=0)
+    offset: float = limited(0.0, least=0, unit="V")
+    shift: float = limited(0.0, least=0, most=LONGEST, unit="m")
+    common_mode: float = limited(0.0, least=0)
+    scale: float = limited(MODEL_ERROR, least=0)
 
     def __check_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0 <= value < np.inf:
-                raise InverseError(f"{name} is {value}; give a standard deviation, zero or more")
+        require_limits(self, InverseError)
         if not any(value for name, value in vars(self).items() if name != "scale"):
             raise InverseError("all standard deviations are zero; give one above zero to what is unknown")
 
