@@ -23,13 +23,13 @@ import jaxeit as je
 
 from ..calibration.calibration import Calibration, load_calibration
 from ..calibration.procedure import calibrate
-from ..calibration.recipe import Recipe
+from ..calibration.recipe import Recipe, recipe_or_default
 from ..report.document import write_report
 from ..report.figures.parts import require_matplotlib
 from ..report.log_document import write_log_report
 from ..runtime import settings, take_over
 from ..session import Session, SessionError, open_session
-from ..session.given import paths_of
+from ..session.given import paths_of, require_skin_or_none
 from .digests import describe, digest
 from .logs import ensure_log_calibration
 from .workers import ONE_AT_A_TIME, spawned_pool
@@ -125,7 +125,9 @@ def calibrate_many(
     """
     if report:
         require_matplotlib()
-    tasks = _tasks(paths_of(paths, "calibrate_many"), Path(out), report, skin, recipe or Recipe(), ignore_errors)
+    require_skin_or_none(skin, "calibrate_many")
+    recipe = recipe_or_default(recipe, "calibrate_many")
+    tasks = _tasks(paths_of(paths, "calibrate_many"), Path(out), report, skin, recipe, ignore_errors)
     outcomes: dict[str, Outcome] = {}
 
     def note(outcome: Outcome) -> None:

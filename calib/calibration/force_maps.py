@@ -85,7 +85,7 @@ def force_map(
     frames: ArrayLike,
     pressures: ArrayLike,
     *,
-    gate: float = 0.6,
+    gate: float = je.fusion.USUAL_GATE,
     before: np.ndarray | None = None,
 ) -> ForceEstimate:
     """Force maps from changes of frames and pad pressures against the skin without contact.

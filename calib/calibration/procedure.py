@@ -28,7 +28,7 @@ from ..presses.pooled import PooledPresses, pool_presses
 from ..presses.skins import differing_parts
 from ..presses.table import PressMeasurements, Processing, measure
 from ..session import Session, SessionError
-from ..session.given import require_session, sessions_of
+from ..session.given import require_session, require_skin_or_none, sessions_of
 from .archives.storage import describe
 from .calibration import Calibration
 from .evaluation import Evaluation, centre_of
@@ -43,7 +43,7 @@ from .logs.evaluation import LogEvaluation
 from .logs.procedure import evaluate_log
 from .press_examples import press_examples, press_probes
 from .recalibration.agreement import agreement_of_presses
-from .recipe import Recipe
+from .recipe import Recipe, recipe_or_default
 
 STAGES = ("reading", "model and images", "fitting", "holding out")
 # Further stages, if the recipe asks for them.
@@ -78,7 +78,8 @@ def calibrate(
     sessions = sessions_of(sessions, "calibrate")
     _require_eit(sessions)
     require_each_once(sessions)
-    recipe = recipe or Recipe()
+    require_skin_or_none(skin, "calibrate")
+    recipe = recipe_or_default(recipe, "calibrate")
     skin = skin or _one_skin(sessions)
     progress("reading")
     presses = pool_presses(sessions, skin, recipe.processing)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import NoneType
 
 import jaxeit as je
 from jaxeit.kinds import require_kind
@@ -148,3 +149,14 @@ class Recipe:
     def locates(self) -> bool:
         """Whether any of the `locations` needs the place of a press."""
         return any(location is not None for location in self.locations)
+
+
+def recipe_or_default(recipe: Recipe | None, call: str) -> Recipe:
+    """The recipe that a ``call`` was given, or that of the paper.
+
+    Raises:
+        RecipeError: if it is no recipe, such as the path of one.
+    """
+    give = "one, such as calib.Recipe(curve=calib.Linear()) or calib.Recipe.load('recipe.toml')"
+    require_kind(recipe, (Recipe, NoneType), RecipeError, "a recipe", give, call)
+    return recipe or Recipe()

@@ -10,7 +10,7 @@ import jaxeit as je
 from ..presses.onsets import OnsetDelay
 from ..record.journal.records import EventCode
 from ..session import Session
-from ..session.given import require_session
+from ..session.given import require_session, require_skin_or_none
 from ..session.units import wrong_quantity
 from .eit.reading_order import OrderCheck
 from .eit.readings import check_eit
@@ -58,6 +58,7 @@ def check_session(
         SessionError: for a path or another object in the place of the session.
     """
     require_session(session, "check_session")
+    require_skin_or_none(skin, "check_session")
     findings = [*_session_findings(session)]
     skin = check_skin(session, skin, findings)
     statistics = _checked_streams(session, skin, progress, findings)

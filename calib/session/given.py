@@ -3,8 +3,10 @@
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
+import jaxeit as je
 from jaxeit.kinds import require_kind
 
 from .errors import SessionError
@@ -23,6 +25,18 @@ def require_session(session: Any, call: str) -> None:
         SessionError: naming the call, and the function that opens the file.
     """
     require_kind(session, Session, SessionError, "a Session", call_on("calib.open_session", session), call)
+
+
+def require_skin_or_none(skin: Any, call: str) -> None:
+    """Refuse what is neither a skin nor None, such as a recipe or a path in the place of the skin, in a ``call``.
+
+    Raises:
+        SessionError: naming the call, and how a skin is given.
+    """
+    give = (
+        "one, such as skin=jaxeit.load_skin('testbed'), or None for that of the session; other choices by their names"
+    )
+    require_kind(skin, (je.Skin, NoneType), SessionError, "a skin", give, call)
 
 
 def sessions_of(given: Session | Iterable[Session], call: str) -> list[Session]:

@@ -13,6 +13,7 @@ import jaxeit as je
 from calib.calibration.recipe import RecipeError
 from calib.cli.recipe_options import add_recipe_arguments, recipe_of
 from calib.fitting import CURVES, FIELDS, LOSSES
+from calib.session import SessionError
 from jaxeit.toml import TomlError
 
 from .quick_bench import QUICK
@@ -313,3 +314,13 @@ def test_what_was_cut_one_way_is_evaluated_that_way(grid, folder):
 def test_what_stands_in_the_place_of_a_choice_is_refused(choices, said):
     with pytest.raises(RecipeError, match=f"recipe: {said}"):
         calib.Recipe(**choices)
+
+
+def test_a_recipe_in_the_place_of_the_skin_is_told(grid):
+    with calib.open_session(grid) as session:
+        with pytest.raises(SessionError, match=r"calibrate: .*Recipe.* is not a skin; give one, such as skin="):
+            calib.calibrate([session], calib.Recipe())
+        with pytest.raises(RecipeError, match=r"calibrate: 'r\.toml' is not a recipe; give one, such as calib\.Recipe"):
+            calib.calibrate([session], recipe="r.toml")
+        with pytest.raises(SessionError, match="check_session: 'testbed' is not a skin"):
+            calib.check_session(session, "testbed")

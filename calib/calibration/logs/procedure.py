@@ -39,7 +39,7 @@ from ...presses.streams import resample
 from ...session import Session, SessionError, Stream, write_archive
 from ...session.given import call_on, require_session, sessions_of
 from ..fitted_sessions import FITTED, is_fitted, require_each_once
-from ..recipe import Recipe
+from ..recipe import Recipe, recipe_or_default
 from ..recipe_text import AUTO_CURVES, SWITCHES
 from .calibration import LogCalibration
 from .evaluation import LogEvaluation, log_evaluation
@@ -81,7 +81,7 @@ def calibrate_logs(
     if not sessions:
         raise SessionError("calibrate_logs: no session given; give one or more logs")
     require_each_once(sessions)
-    recipe = recipe or Recipe()
+    recipe = recipe_or_default(recipe, "calibrate_logs")
     ignored = accept(sessions, None, ignore_errors=ignore_errors)
     signal = _same_signal(sessions)
     series, locations, placed = _with_places(_series(sessions, recipe), recipe, sessions)
