@@ -27,10 +27,10 @@ import calib
 import jaxeit as je
 from calib.bench import Bench, load_bench, simulate
 from calib.calibration.localisation.electrode_places import PlacedElectrodes
-from calib.calibration.localisation.load_windows import FIDELITY as MESH
+from calib.calibration.localisation.load_windows import LOAD_FIDELITY
 from calib.check import check_session
-from calib.check.electrodes import FIDELITY as PLACING
-from calib.check.placement import FIDELITY, WHERE, placement_finding, with_placement
+from calib.check.electrodes import ELECTRODE_FIDELITY
+from calib.check.placement import PLACEMENT_FIDELITY, WHERE, placement_finding, with_placement
 from calib.check.report import CheckReport
 from calib.fitting.intervals import NORMAL_MULTIPLE
 from jaxeit.imaging import KnownPresses, find_misplacement, fit_electrodes
@@ -101,7 +101,7 @@ def announced(run: Run) -> Iterator[Row]:
     """Skins whose bolts sit aside: how many are announced, and what it costs without and with fitted electrodes."""
     frames, skins, known, later = run.sizes((20, 2, 9, 12), (1, 1, 2, 1))
     skin, seeds = je.load_skin("testbed"), range(ANNOUNCED_SEED, ANNOUNCED_SEED + frames)
-    model, asked = (je.discretise(je.Scene(skin), fidelity) for fidelity in (MESH, FIDELITY))
+    model, asked = (je.discretise(je.Scene(skin), fidelity) for fidelity in (LOAD_FIDELITY, PLACEMENT_FIDELITY))
     for aside in run.sizes(ASIDE, ASIDE[-1:]):
         rows = []
         for seed in seeds:
@@ -144,10 +144,12 @@ class Drilled:
         place = np.concatenate([press.places for press in self.presses])
         noise = np.full(len(self.untouched), self.noise)
         given = KnownPresses(self.change[known], place[known], noise)
-        fit = None if smoke else fit_electrodes(je.discretise(je.Scene(skin), PLACING), self.untouched, given)
+        fit = (
+            None if smoke else fit_electrodes(je.discretise(je.Scene(skin), ELECTRODE_FIDELITY), self.untouched, given)
+        )
         moved = skin.electrode_positions + (0 if fit is None else np.asarray(fit.shift))
         there = je.skin.with_positions(skin, moved)
-        fitted = je.discretise(je.Scene(there), MESH)
+        fitted = je.discretise(je.Scene(there), LOAD_FIDELITY)
         row = dict(self._told(model, place, noise, ""))
         row |= dict(self._told(fitted, place, noise, "_fitted"))
         return row | {"said_fitted": float(self.said(there))}
@@ -221,7 +223,9 @@ def size_of(session: calib.Session) -> tuple[float, float, float]:
     report = check_session(session)
     channels = report.channels
     skin = je.skin.parse_skin(session.skin_toml, session.name)
-    found = find_misplacement(je.discretise(je.Scene(skin), FIDELITY), np.where(channels.bad, np.nan, channels.mean))
+    found = find_misplacement(
+        je.discretise(je.Scene(skin), PLACEMENT_FIDELITY), np.where(channels.bad, np.nan, channels.mean)
+    )
     return float(bool(said_by(report, session))), 1e3 * float(found.size), float(found.evidence)
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxeit as je
-from calib.calibration.localisation.load_windows import FIDELITY
+from calib.calibration.localisation.load_windows import LOAD_FIDELITY
 from jaxeit.linalg import NestedDissection
 from tests.oracles.disc import disc_potentials
 from tests.oracles.rectangle import green
@@ -170,7 +170,7 @@ class Pressed(NamedTuple):
 
 def fit_model(skin: str = "testbed") -> je.Model:
     """The mesh on which contacts are fitted to recordings of a skin."""
-    return je.discretise(je.Scene(je.load_skin(skin)), FIDELITY)
+    return je.discretise(je.Scene(je.load_skin(skin)), LOAD_FIDELITY)
 
 
 def uneven(seed: int) -> tuple[je.effects.AbstractEffect, ...]:

@@ -12,7 +12,7 @@ from .eit.reading_order import OrderCheck
 from .report import ChannelTable, ElectrodeRow, Finding, Severity, listed
 
 # The errors of a mesh of first order would be taken for shifts of electrodes.
-FIDELITY = je.Fidelity(order=2, edge_length=je.Fidelity.draft().edge_length)
+ELECTRODE_FIDELITY = je.Fidelity(order=2, edge_length=je.Fidelity.draft().edge_length)
 # Of the root mean square misfit in stated errors: beyond it, the skin is another one than its file says.
 LARGEST_MISFIT = 3.0
 SIGNIFICANCE = 4.0  # standard errors of a shift; honest sessions reach 1.7
@@ -35,7 +35,7 @@ def check_electrodes(
         findings.append(Finding(Severity.OK, WHERE, f"places of the electrodes not checked: {obstacle}"))
         return ()
     try:
-        fit = fit_electrodes(je.discretise(je.Scene(skin), FIDELITY), np.where(table.bad, np.nan, table.mean))
+        fit = fit_electrodes(je.discretise(je.Scene(skin), ELECTRODE_FIDELITY), np.where(table.bad, np.nan, table.mean))
     except ValueError as error:
         findings.append(Finding(Severity.OK, WHERE, f"places of the electrodes not checked: {error}"))
         return ()

@@ -20,7 +20,7 @@ from .electrodes import OTHER_CAUSE, WHERE
 from .report import CheckReport, Finding, Severity
 
 # The mesh of a calibration, whose programs are compiled for its coat already.
-FIDELITY = je.Fidelity.standard()
+PLACEMENT_FIDELITY = je.Fidelity.standard()
 # Of the evidence, and of the size in m. On honest skins of two simulators, at 30 to 80 dB, with coats of deviations up
 # to 0.6, they reach 110 and 0.17 mm, and never both; skins whose bolts are 0.5 mm aside begin at 110 and 0.43 mm.
 MIN_EVIDENCE, MIN_SIZE = 50.0, 3e-4
@@ -46,10 +46,10 @@ def placement_finding(
     Args:
         untouched: mean frame without contact, V.
         used: which of its readings are used.
-        model: of the skin at `FIDELITY`, where there is one already.
+        model: of the skin at `PLACEMENT_FIDELITY`, where there is one already.
     """
     try:
-        model = je.discretise(je.Scene(skin), FIDELITY) if model is None else model
+        model = je.discretise(je.Scene(skin), PLACEMENT_FIDELITY) if model is None else model
         found = find_misplacement(model, np.where(used, untouched, np.nan))
     except (InverseError, MotionError):
         return None

@@ -42,8 +42,8 @@ MAX_WAITING = 8  # blocks whose image is not computed yet
 MAX_CONTACTS = 200  # that an update uses, counted at each place; older ones are forgotten
 MIN_CONTACTS = 8  # before the first update
 MAX_MOVE = 0.3  # of a log gain, away from that of the calibration
-ZERO_TIME = 10.0  # s in which the zero follows
-QUIET_FRACTION = 0.1  # of the pressure of a loaded pad: the zero follows no faster than this in `ZERO_TIME`
+ZERO_SECONDS = 10.0  # in which the zero follows
+QUIET_FRACTION = 0.1  # of the pressure of a loaded pad: the zero follows no faster than this in `ZERO_SECONDS`
 MAX_OFFSET = 1.0  # of that pressure, away from the rest levels that were measured
 SAVE_INTERVAL = 60.0  # s
 
@@ -175,7 +175,7 @@ class LiveRecalibrator:
         quiet = QUIET_FRACTION * self._threshold
         over = np.clip(np.nan_to_num(pressure), -quiet, quiet)
         bound = MAX_OFFSET * self._threshold
-        self.offset = np.clip(self.offset + over * min(seconds / ZERO_TIME, 1.0), -bound, bound)
+        self.offset = np.clip(self.offset + over * min(seconds / ZERO_SECONDS, 1.0), -bound, bound)
 
     def use_spare_time(self) -> None:
         """Between contacts, compute image and forces of one block, or begin an update if all blocks are computed."""

@@ -7,7 +7,7 @@ import pytest
 import jaxeit as je
 from benchmarks.bench_loads import INSIDE, TIP_SPREAD, shaped
 from benchmarks.problems import pressed, uneven
-from calib.calibration.localisation.load_windows import FIDELITY
+from calib.calibration.localisation.load_windows import LOAD_FIDELITY
 from jaxeit.contacts import prepare_loads
 from jaxeit.contacts.loads.considered import Known, inverse_of, mean_errors
 from jaxeit.contacts.loads.pressure import MAX_LOADS, Form, even_moments, shape_directions, spot, tilt_directions
@@ -103,7 +103,7 @@ def test_even_moments_are_equal_at_opposite_places():
 @pytest.mark.parametrize("shape", ["tilted", "ring"])
 def test_ellipses_hold_tips_of_other_shapes_where_noise_is_low(shape):
     """80 dB, on four sheets known from untouched frames, on a mesh, a coat and a gain that the fit does not know."""
-    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    model = je.discretise(je.Scene(je.load_skin("testbed")), LOAD_FIDELITY)
     inside = []
     for seed in range(4200, 4204):
         touches = list(shaped(np.random.default_rng(seed), shape, 10))

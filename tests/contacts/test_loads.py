@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from calib.calibration.localisation.load_windows import FIDELITY
+from calib.calibration.localisation.load_windows import LOAD_FIDELITY
 from jaxeit.contacts import LoadKind, LoadSettings, prepare_loads
 from jaxeit.contacts.loads.comparison import Comparison, Fit, padded
 from jaxeit.contacts.loads.preparation import field_modes
@@ -70,7 +70,7 @@ def test_near_tips_are_told_apart_where_only_round_ones_touch(ready):
     frames, noise, blank = frames_of([pair(0.1, 0.08, 0.02, 0.7), single(0.06, 0.13)], seed=4)
     usual = fitter(frames[0], finder(frames[0]))
     assert usual.kind is not LoadKind.TWO
-    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    model = je.discretise(je.Scene(je.load_skin("testbed")), LOAD_FIDELITY)
     of_round = prepare_loads(model, LoadSettings.round_tips(), noise=noise, untouched=blank)
     two, one = (of_round(frame, finder(frame)) for frame in frames)
     assert two.kind is LoadKind.TWO
@@ -337,7 +337,7 @@ def test_what_cannot_be_fitted_is_refused(ready):
 @pytest.mark.slow
 def test_ellipses_hold_nine_of_ten_places():
     """Single touches anywhere, three sheets known from v0, on a mesh whose own error is small beside the gain's."""
-    model = je.discretise(je.Scene(je.load_skin("testbed")), FIDELITY)
+    model = je.discretise(je.Scene(je.load_skin("testbed")), LOAD_FIDELITY)
     inside = []
     for seed in range(3):
         rng = np.random.default_rng(100 + seed)

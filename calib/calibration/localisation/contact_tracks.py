@@ -26,7 +26,7 @@ from jaxeit.tracking import (
 
 from ..calibration import Calibration
 from ..frame_blocks import FrameBlocks
-from .load_windows import FIDELITY
+from .load_windows import LOAD_FIDELITY
 from .press_images import taken_for_even
 from .quiet_frames import ENOUGH, QuietFrames
 
@@ -68,7 +68,7 @@ def prepare_calibrated_tracker(
     channels = np.asarray(calibration.recon.channels) & (noise > 0) & np.isfinite(noise)
     if not channels.any():
         raise NotFollowed("no reading has noise without contact, so none tells how sure it is")
-    model = je.discretise(je.Scene(calibration.skin), FIDELITY)
+    model = je.discretise(je.Scene(calibration.skin), LOAD_FIDELITY)
     errors = _covariance(np.where(channels, noise, 1.0), np.where(channels, untouched, 0.0))
     prepare = partial(je.tracking.prepare_tracker, model, calibration.skin, settings, noise=errors, channels=channels)
     try:

@@ -10,7 +10,7 @@ import numpy as np
 import jaxeit as je
 from jaxeit.imaging import InverseError, KnownPresses, fit_electrodes
 
-from ...check.electrodes import FIDELITY, LARGEST_MISFIT
+from ...check.electrodes import ELECTRODE_FIDELITY, LARGEST_MISFIT
 from ...presses.pooled import PooledPresses
 from ..archives.arrays import shaped
 from .spread import farthest_first
@@ -92,7 +92,7 @@ def place_electrodes(skin: je.Skin, presses: PooledPresses) -> tuple[je.Skin, Pl
     change = np.where(presses.channels, presses.dv[chosen], np.nan)
     noise = np.where(np.isfinite(presses.noise), presses.noise, 1.0)  # of readings that were never finite: any
     known = KnownPresses(jnp.asarray(change), jnp.asarray(presses.position[chosen]), jnp.asarray(noise))
-    model = je.discretise(je.Scene(skin), FIDELITY)
+    model = je.discretise(je.Scene(skin), ELECTRODE_FIDELITY)
     fit = fit_electrodes(model, np.where(presses.channels, presses.untouched, np.nan), known)
     if not float(fit.misfit) < LARGEST_MISFIT:
         raise InverseError(

@@ -25,7 +25,7 @@ from .press_images import fit_untouched_sheet
 from .quiet_frames import QuietFrames
 
 # The mesh moves a load by 0.05 mm, a tenth of what the gain of the contact layer does; a draft moves it by 0.15 mm.
-FIDELITY = je.Fidelity(edge_length=0.05, electrode_segments=10, growth=1.5)
+LOAD_FIDELITY = je.Fidelity(edge_length=0.05, electrode_segments=10, growth=1.5)
 # Chi-square over the number of readings of a fit, and part of the windows beyond it from which it is worth a line. On
 # honest skins of another simulator the median reaches 2; where bolts are 2 mm aside it begins at 25.
 SURPRISING, MIN_SURPRISING = 6.0, 0.5
@@ -132,7 +132,7 @@ def fit_windows(
         return SeenLoads({}, (), (), why)
     sound = np.isfinite([window.frame for window in seen.windows]).all(0)
     channels = np.asarray(calibration.recon.channels) & (noise > 0) & sound
-    model = je.discretise(je.Scene(calibration.skin), FIDELITY)
+    model = je.discretise(je.Scene(calibration.skin), LOAD_FIDELITY)
     sheet, _ = fit_untouched_sheet(model, seen.quiet.untouched, channels)
     of_means = np.where(channels, noise, 1.0) / np.sqrt(np.median([window.frames for window in seen.windows]))
     known = {"noise": of_means, "sigma": sheet, "channels": channels}

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 import jaxeit as je
 
-from ...check.placement import FIDELITY, placement_note
+from ...check.placement import PLACEMENT_FIDELITY, placement_note
 from ...fitting.fields import Places
 from ...presses.pooled import PooledPresses
 from ..recipe import Recipe
@@ -70,7 +70,7 @@ def prepare_imager(skin: je.Skin, presses: PooledPresses, recipe: Recipe) -> Ima
         InverseError, HyperparameterError: if no image can be made with these choices.
     """
     imaging, model = recipe.imaging, je.discretise(je.Scene(skin), recipe.fidelity)
-    same = model if recipe.fidelity == FIDELITY else None
+    same = model if recipe.fidelity == PLACEMENT_FIDELITY else None
     doubt = placement_note(skin, presses.untouched, presses.channels, same)
     sigma, notes = (None, ()) if recipe.even_sheet else fit_untouched_sheet(model, presses.untouched, presses.channels)
     recon = imaging.prepare(

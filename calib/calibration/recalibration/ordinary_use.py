@@ -27,7 +27,7 @@ MAX_OBSERVATIONS = 400  # of a session, because the cost grows with the cube
 NOISE_MULTIPLE = 5.0  # of the noise of a bin: a pad that differs more from its zero is being pressed or released
 SMALL_FRACTION = 0.01  # of the pressure of a loaded pad: less is no load, however small the noise
 MAX_RAMP = 100  # bins before and after a load that may belong to it
-ZERO_TIME = 10.0  # bins over which the zero follows the pressure while nothing is loaded
+ZERO_BINS = 10.0  # over which the zero follows the pressure while nothing is loaded
 
 
 class UseContacts(NamedTuple):
@@ -133,7 +133,7 @@ def zero_and_loads(
         over = np.nan_to_num(row - zero)
         loaded[i] = bool((over > threshold).any())
         if not loaded[i]:
-            zero = zero + np.clip(over, -quiet, quiet) / ZERO_TIME
+            zero = zero + np.clip(over, -quiet, quiet) / ZERO_BINS
         zeros[i] = zero
     return loaded, zeros
 
