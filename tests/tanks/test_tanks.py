@@ -198,7 +198,10 @@ def test_image_takes_the_choices_of_images_and_priors_of_ones_own(bench, tmp_pat
     (tmp_path / "tank.toml").write_text(TANK_TOML.replace("eidors-adjacent", "adjacent"))
     np.save(tmp_path / "frames.npy", bench.frames)
     files = [str(tmp_path / "frames.npy"), "--skin", str(tmp_path / "tank.toml"), "-o", str(tmp_path / "a.png")]
-    for choices in (["--prior", f"{__name__}:Faint", "--pixels", "12"], ["--basis", "bumps:columns=9", "--method", "greit"]):
+    for choices in (
+        ["--prior", f"{__name__}:Faint", "--pixels", "12"],
+        ["--basis", "bumps:columns=9", "--method", "greit"],
+    ):
         assert main(["image", *files, *choices]) == 0
     capsys.readouterr()
     assert main(["image", *files, "--prior", "laplac"]) == 2
