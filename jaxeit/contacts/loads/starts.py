@@ -11,6 +11,7 @@ from scipy.special import logsumexp
 
 from ...effects.material import ContactPiezoresistance
 from ..result import Contacts
+from ..starts import MIN_INDEPENDENT_FRACTION
 
 if TYPE_CHECKING:
     from .comparison import Fit
@@ -74,13 +75,19 @@ class Starts(eqx.Module):
         return fall, np.concatenate([two.loads[:2, :4], atom])
 
     def atom(self, left: np.ndarray, root: np.ndarray, slopes: np.ndarray | None = None) -> tuple[float, np.ndarray]:
-        """The atom that explains most of what is left in units of errors: fall of chi-square, and the load (1, 4)."""
+        """The atom that explains most of what is left in units of errors: fall of chi-square, and the load (1, 4).
+
+        An atom that the slopes explain nearly all of is no other load: its strength would be a quotient of roundings.
+        """
         atoms = solve_triangular(root, np.asarray(self.atoms).T, lower=True)
+        whole = np.linalg.norm(atoms, axis=0)
         if slopes is not None:
             along = orth(solve_triangular(root, slopes, lower=True))
             atoms, left = (part - along @ (along.T @ part) for part in (atoms, left))
         norms = np.linalg.norm(atoms, axis=0)
-        gain = atoms.T @ left / norms
+        apart = norms**2 > MIN_INDEPENDENT_FRACTION * whole**2
+        norms = np.where(apart, norms, 1)
+        gain = np.where(apart, atoms.T @ left / norms, -np.inf)
         best = int(np.argmax(gain))
         force = max(gain[best] / norms[best], 0.02)  # over that of the atom
         fall = float(max(gain[best], 0) ** 2)
