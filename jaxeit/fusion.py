@@ -48,6 +48,9 @@ __all__ = [
     "pad_masks",
 ]
 
+USUAL_GATE = 0.6
+"""Smallest concentration of a valid image, where no other is given; that of noise is 0.5."""
+
 
 class FusionError(ValueError):
     """Masks or forces whose shape does not fit the image."""
@@ -256,7 +259,7 @@ def fuse(
     masks: PadMasks,
     pad_forces: Float[ArrayLike, "... pads"] | Sequence[float],
     *,
-    gate: Float[ArrayLike, ""] = 0.6,
+    gate: Float[ArrayLike, ""] = USUAL_GATE,
     contacts: ContactShares | None = None,
     pad_errors: Float[ArrayLike, "... pads"] | Sequence[float] | None = None,
 ) -> ForceMap:

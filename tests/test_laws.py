@@ -2,6 +2,7 @@
 
 import ast
 import os
+import pkgutil
 import re
 import subprocess
 import sys
@@ -124,6 +125,28 @@ def test_factors_and_solves_are_those_that_are_safe_under_vmap():
     }
     own = {"jaxeit/linalg/lapack.py", "jaxeit/linalg/nested_dissection.py"}
     assert {(path, name) for path, name in found if path not in own} == set()
+
+
+def _names_in_messages():
+    """Names such as je.imaging.LCurve in texts that are no docstrings, and the files that have them."""
+    for package in ("jaxeit", "calib"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.walk(_without_docstrings(ast.parse(path.read_text()))):
+                text = node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
+                if " " in text.strip():  # the others are names of files, groups and modules
+                    for name in re.findall(r"\b(?:je|jaxeit|calib)(?:\.[A-Za-z_]\w*)+", text):
+                        yield name, path
+
+
+def test_names_that_messages_advise_exist():
+    names = set(_names_in_messages())
+    assert len(names) > 20
+    for name, path in names:
+        package, *parts = name.split(".")
+        try:
+            pkgutil.resolve_name(".".join([{"je": "jaxeit"}.get(package, package), *parts]))
+        except (AttributeError, ImportError):
+            pytest.fail(f"{path}: there is no {name}")
 
 
 def test_no_path_of_a_machine_in_the_project():

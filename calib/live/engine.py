@@ -38,7 +38,6 @@ TOUCH_SIGNIFICANCE = 3.0  # a force above this many standard errors is a touch
 MAX_SEARCH_DELAY = 0.1  # s; then contacts are fitted even if a frame is dropped for it
 MAX_NEGATIVE_TIME = 1.0  # s below zero on a skin that nothing presses, after which the rest levels must be wrong
 MAX_PLACE_AGE = 0.3  # s; older contacts do not describe the present frame
-GATE = 0.6  # see `jaxeit.fuse`
 IMAGE_DTYPE = "float32"  # of the image product; its matrices are built in float64, but read in half the memory
 
 MEASURING = "measuring the rest levels: do not touch the skin"
@@ -192,7 +191,9 @@ def _compiled(function: Callable[..., T]) -> Callable[..., T]:
 def _packed_forces(model: ForceModel, image: Array, pressure: Array, places: Places, before: Array | None) -> Array:
     """The fields of `FrameForces` in one row, so that one transfer from the device suffices."""
     image = image.astype(model.recon.dtype)
-    found = fused(model, image, pressure, places if model.pads.field is not None else None, before, GATE)
+    found = fused(
+        model, image, pressure, places if model.pads.field is not None else None, before, je.fusion.USUAL_GATE
+    )
     loaded, negative = is_loaded(model, pressure), is_loaded(model, -pressure)
     parts = found.map.force, found.force, found.standard_error, found.valid, loaded, negative
     return jnp.concatenate([part[0].astype(found.force.dtype) for part in parts])

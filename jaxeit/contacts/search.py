@@ -73,8 +73,8 @@ class ContactFinder(eqx.Module):
     | meaning                                                                   | shape        | unit  |
     |---------------------------------------------------------------------------|--------------|-------|
     | whitening: what is used of a frame                                        |              |       |
-    | compress: from pair sums to the directions that bumps reach               | (r, k)       |       |
-    | rest: what whitened readings have beside them                             | (r', k)      |       |
+    | compress: from weighted sums to the directions that bumps reach           | (r, k)       | ohm   |
+    | rest: from weighted sums to what whitened readings have beside them       | (r', k)      | ohm   |
     | responses                                                                 |              |       |
     | atoms, starts, norms, alike: see `Atoms`                                  |              |       |
     | low, high: bounds of x, y, log width, strength                            | (4,), (4,)   |       |

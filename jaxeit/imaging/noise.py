@@ -2,8 +2,8 @@
 
 All readings are differences of the L(L-1)/2 *pair sums*, entries of the transfer matrix (see `jacobian`): ``v = P z``
 with four entries in each row of P.  So a frame of 1,372 readings of 25 electrodes holds at most 300 numbers, and a
-linear reconstruction need not know more of it than ``t = P^T W dv``, W the inverse covariance of the noise: from
-``J = P J_z``,
+linear reconstruction need not know more of it than the *weighted sums* ``t = P^T W dv``, W the inverse covariance of
+the noise: from ``J = P J_z``,
 
     (J^T W J + l^2 R)^-1 J^T W dv  =  (J_z^T G J_z + l^2 R)^-1 J_z^T t,      G = P^T W P.
 
@@ -46,10 +46,12 @@ class ConvergenceError(InverseError):
 class Whitening(eqx.Module):
     """The pair sums that a protocol measures, and how well.
 
+    Here ``pairs`` are numbers of pair sums. Where they are electrodes, (k, 2), other classes say so.
+
     | meaning                                                              | shape              | unit  |
     |----------------------------------------------------------------------|--------------------|-------|
     | pairs: the four pair sums z0 - z1 - z2 + z3 of each reading          | (readings, 4)      |       |
-    | lines, sign: the readings that each pair sum occurs in; sign 0: none | (k, c)             |       |
+    | lines, sign: the readings that each pair sum occurs in, and its sign or share there; 0: none | (k, c) |  |
     | shares of ``pairs`` in each reading, and (readings, n) pairs, where the protocol has a mixing |     | |
     | current                                                              | ()                 | A     |
     | weight: inverse of the noise, as variances or as a covariance matrix | (readings,) or     | 1/V^2 |
@@ -71,12 +73,12 @@ class Whitening(eqx.Module):
         return self.current * (jnp.asarray(SIGNS, self.sign.dtype) if self.shares is None else self.shares)
 
     def sums(self, dv: Float[Array, "... readings"]) -> Float[Array, "... k"]:
-        """``t = P^T W dv``; channels that are not used may hold anything."""
+        """The weighted sums ``t = P^T W dv``, A/V; channels that are not used may hold anything."""
         dv = jnp.where(self.channels, dv, 0)
         return self.pair_sums(dv * self.weight if self.weight.ndim == 1 else dv @ self.weight)
 
     def pair_sums(self, values: Float[Array, "... readings"]) -> Float[Array, "... k"]:
-        """``P^T v``."""
+        """``P^T v``: for each pair sum, the sum of the values of its readings, times the current."""
         if values.ndim == 1:
             return self.current * jnp.sum(self.sign * values[self.lines], -1)
         batch = values.shape[:-1]
@@ -87,7 +89,7 @@ class Whitening(eqx.Module):
         return self.current * sums.T.reshape(*batch, len(self.lines))
 
     def readings(self, z: Float[Array, "k ..."]) -> Float[Array, "readings ..."]:
-        """``P z``."""
+        """``P z``: readings, V, of pair sums, ohm."""
         if self.shares is not None:
             return self.current * Mixing(self.pairs, self.shares)(z)
         first, second, third, fourth = (z[column] for column in self.pairs.T)
@@ -161,7 +163,7 @@ class Whitened(NamedTuple):
     | whitening                                         |        |      |
     | electrodes: whose pair each sum is                | (k, 2) |      |
     | factor C: from pair sums to whitened readings     | (r, k) | 1/ohm |
-    | compress E: from the sums ``t`` to whitened readings | (r, k) | ohm |
+    | compress E: from the weighted sums to whitened readings | (r, k) | ohm |
     """
 
     whitening: Whitening
@@ -404,7 +406,7 @@ def _known_inverse(noise: np.ndarray, channels: np.ndarray) -> np.ndarray:
         raise InverseError(
             "the covariance of the noise is not symmetric positive definite; a recording of fewer frames than readings "
             "gives such a one: give standard deviations instead, or shrink it towards its diagonal "
-            "(jaxeit.noise_covariance does)"
+            "(je.imaging.noise_covariance does)"
         )
     return weight
 

@@ -43,7 +43,7 @@ class AbstractReconstructor(AbstractPictured):
     | meaning                                                                        | shape     | unit |
     |--------------------------------------------------------------------------------|-----------|------|
     | whitening: which readings are used, and how much they weigh                    |           |      |
-    | predict: pair sums of the one-step image, from the sums ``P^T W dv``           | (k, k)    | ohm2 |
+    | predict: pair sums of the one-step image, from the weighted sums ``P^T W dv``  | (k, k)    | ohm2 |
     | picture: where the image lies                                                  |           |      |
     | provenance                                                                     |           |      |
     """
@@ -54,7 +54,7 @@ class AbstractReconstructor(AbstractPictured):
 
     @abstractmethod
     def _image(self, sums: Float[Array, "... k"]) -> Float[Array, "... basis"]:
-        """The image, from ``P^T W dv``."""
+        """The image, from the weighted sums ``P^T W dv``."""
 
     def __call__(self, dv: Float[ArrayLike, "... readings"]) -> Float[Array, "... basis"]:
         """The image, S, of a difference of frames, V; any leading axes are batches.
@@ -171,7 +171,7 @@ class Reconstructor(AbstractReconstructor):
 
     | meaning                                                                          | shape      | unit |
     |----------------------------------------------------------------------------------|------------|------|
-    | factor: image per pair sum                                                       | (basis, k) | S V  |
+    | factor: image per weighted sum, entry of ``P^T W dv`` in A/V                     | (basis, k) | S ohm |
     | variance left to each coefficient by readings and prior; infinite where not known | (basis,)  | S^2  |
     | the rest: `AbstractReconstructor`                                                |            |      |
 

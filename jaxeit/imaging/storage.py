@@ -38,7 +38,7 @@ _SHARED = {
     "edge_length": ("edges", "m", "length of the border that neighbours share"),
 }
 LINEAR_NUMBERS = {
-    "factor": ("basis k", "S V", "image per pair sum"),
+    "factor": ("basis k", "S ohm", "image per weighted sum of the readings, in A/V"),
     "variance": ("basis", "S2", "variance left to each coefficient"),
     **_SHARED,
 }

@@ -182,7 +182,7 @@ def _tables(numbers: Numbers) -> tuple[str, int]:
     tables = (
         ("uint16_t", "pairs", "[SKIN_READINGS][4]", "pair sums that a reading is made of", numbers.pairs),
         ("skin_exact", "weight", "[SKIN_READINGS]", "of a reading, 1/V^2; 0: not used", numbers.weight),
-        ("float", "factor", "[SKIN_PIXELS][SKIN_PAIRS]", "image per pair sum, S V", numbers.factor),
+        ("float", "factor", "[SKIN_PIXELS][SKIN_PAIRS]", "image per weighted sum, S V", numbers.factor),
         ("skin_exact", "predict", "[SKIN_PAIRS * (SKIN_PAIRS + 1) / 2]", "predicts pair sums, V^2", numbers.predict),
         ("float", "unmix", "[SKIN_PADS][SKIN_PADS]", "own pressure of a pad per pressure read", numbers.unmix),
         ("float", "curves", f"[SKIN_PADS][{numbers.curve.coefficients.shape[1]}]", f"CURVE: {numbers.curve.formula}",

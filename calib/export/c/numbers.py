@@ -29,7 +29,7 @@ class Numbers(NamedTuple):
     |----------------------------------------------------------------------------------|-----------------|-------|
     | pairs: the four pair sums of each reading                                        | (readings, 4)   |       |
     | weight of each reading; 0: not used                                              | (readings,)     | 1/V^2 |
-    | factor': image per pair sum t'                                                   | (pixels, k)     | S V   |
+    | factor': image per weighted sum t'                                               | (pixels, k)     | S V   |
     | predict: lower triangle of T', row by row                                        | (k (k + 1) / 2,)| V^2   |
     | exact: whether weight and predict need double precision                          | ()              |       |
     | unmix: own pressures at the calibration per reading of a pad now                 | (pads, pads)    | 1     |

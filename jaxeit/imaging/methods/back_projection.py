@@ -8,7 +8,9 @@ from .base import AbstractLinearMethod, Problem
 
 
 class BackProjection(AbstractLinearMethod):
-    """Each pixel is the mean of the readings weighted by its sensitivity, ``x_j = J_j . y / (|J_j|^2 + floor)``.
+    """Each pixel is the mean of the readings weighted by its sensitivity, ``x_j = J_j . y / (|J_j|^2 + f)``.
+
+    f is ``floor`` of the largest ``|J_j|^2``.
 
     The oldest method, for comparison; it uses neither prior nor hyperparameter, and its images are blurred.
     """
