@@ -159,7 +159,7 @@ def test_pages_name_what_returns_takes_and_raises(pages):
     assert "Returned by: [`je.prepare_contacts`]" in entries["jaxeit.contacts.ContactFinder"]
     assert "Kinds: " in entries["jaxeit.imaging.AbstractPrior"]
     assert "Raised by: " in entries["jaxeit.imaging.InverseError"]
-    assert "[`je.prepare`][jaxeit.imaging.prepare]" in entries["jaxeit.imaging.InverseError"]
+    assert "[`je.fit_background`][jaxeit.imaging.fit_background]" in entries["jaxeit.imaging.InverseError"]
 
 
 class Page(HTMLParser):
