@@ -23,7 +23,7 @@ from ..fitting.response import (
     require_every_pad_pressed,
 )
 from ..fitting.unpressed_walls import unpressed_note
-from ..presses.contradictions import contradicted_presses
+from ..presses.contradictions import contradicted_presses, drifting_pads, moved_places
 from ..presses.pooled import PooledPresses, pool_presses
 from ..presses.skins import differing_parts
 from ..presses.table import PressMeasurements, Processing, measure
@@ -185,8 +185,19 @@ def _notes(found: _Found) -> tuple[str, ...]:
         *found.imager.notes,
         *([f"chosen: {choice.why}"] if choice.why else []),
         *_not_predicted(found.skin, found.held_out.pad_force),
-        *contradicted_presses(presses, found.held_out.pad_force.sum(1), found.images.estimated.get("fitted")),
+        *_contradictions(found),
         *filter(None, [unpressed]),
+    )
+
+
+def _contradictions(found: _Found) -> tuple[str, ...]:
+    """What presses contradict: single ones the others, pads that drift, and places of a stage that is off."""
+    presses, held_out, seen = found.presses, found.held_out.pad_force, found.images.estimated.get("fitted")
+    names, corrected = [pad.name for pad in found.skin.pads], found.response.model.field is not None
+    return (
+        *contradicted_presses(presses, held_out.sum(1), seen),
+        *drifting_pads(presses, names, held_out, by_place=corrected),
+        *(() if seen is None else moved_places(presses, seen)),
     )
 
 

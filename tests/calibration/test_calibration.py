@@ -30,12 +30,13 @@ from calib.fitting.curves import CURVES
 from calib.fitting.curves.play_operators import play, remembered
 from calib.fitting.fields import Places, geometry_of
 from calib.fitting.pads import LocatedPresses, fit_pads
-from calib.presses.contradictions import contradicted_presses
+from calib.presses.contradictions import contradicted_presses, drifting_pads, moved_places
 from calib.presses.pooled import pool_presses
-from calib.presses.table import measure
+from calib.presses.table import PressMeasurements, measure
 from calib.report import document as report
-from calib.session import StreamFacts
+from calib.session import PressTable, StreamFacts
 
+from ..helpers import stand_in
 from ..kill_worker import write_all, write_for_ever
 from .quick_bench import QUICK, SITES, bench
 
@@ -115,6 +116,69 @@ def test_contradicted_places_and_many_contradictions(skin, grid):
     assert f"the place of press 7: ({1e3 * pooled.position[7, 0]:.0f}, " in line
     others = exact * np.where(np.arange(16) % 4, 1.0, 2.0)  # a quarter of the presses: then the fit is to blame
     assert contradicted_presses(pooled, others) == ()
+
+
+@pytest.fixture(scope="module")
+def sixty_four(skin, grid):
+    """Presses in a random order of places, a quarter of them on each pad."""
+    with calib.open_session(grid) as session:
+        pooled = pool_presses([session], skin)
+    rng, count = np.random.default_rng(3), 64
+    position, pad = rng.uniform(0.02, 0.18, (count, 2)), rng.permutation(count) % 4
+    pressure = np.where(np.arange(4) == pad[:, None], 1000.0, 5.0)
+    data = replace(pooled.data, pressure=pressure, force=np.full(count, 10.0), place=np.arange(count))
+    (recording,) = pooled.recordings
+    listed = stand_in(PressTable, t_hold0=10**10 * np.arange(count), accepted=np.ones(count, bool))
+    groups = {name: np.zeros(count, int) for name in pooled.groups}
+    recordings = (stand_in(PressMeasurements, presses=listed, session=recording.session),)
+    return replace(pooled, data=data, position=position, groups=groups, recordings=recordings)
+
+
+def told_forces(presses, factor=1.0, error=0.03):
+    """Forces by the pads, a part `factor` (presses,) of the stated ones, with errors."""
+    noise = np.exp(error * np.random.default_rng(5).normal(size=len(presses.data.force)))
+    return presses.data.share * (factor * noise * presses.data.force)[:, None]
+
+
+@pytest.mark.parametrize("by_place", [True, False])
+def test_pads_that_read_less_and_less_are_named(sixty_four, by_place):
+    names = ["a", "b", "c", "d"]
+    assert drifting_pads(sixty_four, names, told_forces(sixty_four), by_place=by_place) == ()
+    along = np.linspace(0, 1, 64)
+    own = sixty_four.data.share[:, 1] > 0.5
+    leaks = told_forces(sixty_four, np.where(own, np.exp(-0.7 * along), 1.0))
+    leaks[own.nonzero()[0][3]] *= 1.8  # one press that is wrong by itself
+    (line,) = drifting_pads(sixty_four, names, leaks, by_place=by_place)
+    (part,) = map(int, re.findall(r"'b' (-\d+) %", line))
+    assert part == pytest.approx(100 * np.expm1(-0.7), abs=6)
+    (line,) = drifting_pads(sixty_four, names, told_forces(sixty_four, np.exp(0.3 * along)), by_place=by_place)
+    assert re.findall(r"'(\w)' \+\d+ %", line) == names
+
+
+def test_a_drift_that_places_may_explain_is_not_named(sixty_four):
+    """Without a correction by location, where the stage went from one side to the other as time went on."""
+    order = np.argsort(sixty_four.position[:, 1])
+    swept = replace(sixty_four, position=sixty_four.position[order])
+    part = told_forces(swept, np.exp(-0.7 * np.linspace(0, 1, 64)))
+    assert drifting_pads(swept, ["a", "b", "c", "d"], part, by_place=True)
+    assert drifting_pads(swept, ["a", "b", "c", "d"], part, by_place=False) == ()
+
+
+@pytest.mark.parametrize(
+    ("listed", "said"),
+    [
+        (lambda p: p, None),
+        (lambda p: p + np.array([0.01, -0.006]), r"\+10 mm in x and -6 mm in y at the middle; check origin"),
+        (lambda p: 0.1 + 0.8 * (p - 0.1), "-2[45] % of x in x, -2[45] % of y in y; check"),
+        (lambda p: p + 0.2 * (p[:, ::-1] - 0.1) * [1, 0], r"\+(19|20|21) % of y in x; check"),
+    ],
+)
+def test_places_that_lie_aside_as_a_whole_are_named(sixty_four, listed, said):
+    seen = sixty_four.position + 1e-3 * np.random.default_rng(7).normal(size=(64, 2))
+    seen[5], seen[40] = [0.03, 0.17], np.nan  # a press that slipped, and one without a contact
+    lines = moved_places(replace(sixty_four, position=listed(sixty_four.position)), seen)
+    assert len(lines) == (said is not None)
+    assert all(re.search(said, line) for line in lines)
 
 
 @pytest.mark.parametrize("curve", [calib.PowerLaw(), calib.Affine()], ids=lambda c: type(c).__name__)

@@ -1,5 +1,6 @@
 """Recordings that are well formed and cannot be true: each lie is told, and the words that name it are read."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -11,8 +12,12 @@ import jaxeit as je
 from calib.bench import simulate
 from calib.check import Severity, check_session, render, transfer_matrix
 from calib.check.eit.reading_order import predict_readings
+from calib.check.evidence import PressEvidence
+from calib.check.presses.pad_responses import pad_response_findings
+from calib.check.presses.places import pads_under
 from calib.session import StreamFacts, open_session
 
+from ..helpers import stand_in
 from .honest import sixteen_presses
 from .recording import SECOND, Recording, Samples
 
@@ -599,3 +604,28 @@ def test_a_lie_is_named(lie, honest, findings, hard):
     named = [text for text in texts if all(word in text for word in words)]
     assert named, found
     hard(f"lie: {lie}", f"`check`: {severity.name.lower()}", beyond=named[0])
+
+
+def test_a_pad_that_dies_is_named_where_pads_beside_it_bear_a_part(skin):
+    """The load spreads over the walls, so that some pad feels every press."""
+    site = np.array([[0.09, 0.09], [0.03, 0.03], [0.15, 0.03], [0.03, 0.15]] * 6)
+    under = pads_under(skin, site)
+    pressure = np.where(under.T, 800.0, 20.0)
+    own = int(under[:, 0].argmax())
+    dead = np.where((np.arange(24)[:, None] >= 12) & (np.arange(4) == own), 0.3, pressure)
+
+    def named(values):
+        evidence = stand_in(
+            PressEvidence,
+            number=np.arange(24),
+            site=site,
+            force=np.full(24, 10.0),
+            pressure=values,
+            times=np.arange(24) * SECOND,
+        )
+        return [*pad_response_findings(evidence, skin, 0)]
+
+    assert not [found for found in named(pressure) if "feel" in found.what]
+    (found,) = [found for found in named(dead) if "feel" in found.what]
+    assert found.severity is WARNING
+    assert re.search(r"column \d, pad '.*', does not feel 6 of 12 presses on it: 12, 13", found.what)

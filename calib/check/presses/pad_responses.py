@@ -13,6 +13,7 @@ from .places import pads_under
 
 PRESSURE = "/streams/pressure"
 MIN_PAD_RESPONSE = 0.05  # of the usual change of pressure per newton: a press below it is not felt
+MAX_BESIDE = 0.5  # of the usual response of all pads: less is what pads beside the pressed one bear
 MIN_PRESSES_PER_PAD = 3  # from so many presses on, each pad should have been pressed
 MIN_PRESSES = 2  # on one pad, from which its sign or its scale is known
 MIN_STRONGER = 3.0  # times its own pad's response: another column that responds so is that pad's
@@ -43,7 +44,9 @@ def pad_response_findings(evidence: PressEvidence, skin: je.Skin, start: int) ->
         scaled = _scaled_pads(size * np.array([pad.area for pad in skin.pads]) / force[:, None], alone)
         for pad, factor in scaled.items():
             yield _scale_finding(skin, pad, factor)
-        yield from _unfelt_findings(evidence, size.sum(1) / force, np.isin(alone, [*scaled]))
+        known = np.isin(alone, [*scaled])
+        yield from _unfelt_findings(evidence, size.sum(1) / force, known)
+        yield from _silent_findings(evidence, skin, size / force[:, None], np.where(known, -1, alone))
     falling = [*_falling_findings(evidence, skin, strongest, largest, start)]
     yield from falling
     if under.size and not falling:
@@ -119,6 +122,35 @@ def _unfelt_findings(evidence: PressEvidence, response: np.ndarray, known: np.nd
         what = f"no pad feels {len(rows)} of {len(response)} presses that have force: {listed(rows)}"
         remedy = "check the tubes of the pads, and that the pressure stream did not stand still"
         yield Finding(Severity.WARNING, PRESSURE, what, remedy)
+
+
+def _silent_findings(
+    evidence: PressEvidence, skin: je.Skin, response: np.ndarray, alone: np.ndarray
+) -> Iterator[Finding]:
+    """Presses that the pad under the tip does not feel, while it feels others and pads beside it bear little.
+
+    Args:
+        response: (presses, pads) Pa/N.
+        alone: pad under the tip, (presses,); -1: none, or one that is known to be wrong.
+    """
+    whole = response.sum(1)
+    weak = whole < MAX_BESIDE * np.median(whole)
+    unfelt = whole < MIN_PAD_RESPONSE * np.median(whole)
+    for pad in range(response.shape[1]):
+        on, own = alone == pad, response[:, pad]
+        silent = on & weak & ~unfelt & (own < MIN_PAD_RESPONSE * _median(own[on & ~weak]))
+        if silent.any():
+            what = (
+                f"column {pad}, pad {skin.pads[pad].name!r}, does not feel {silent.sum()} of {on.sum()} presses on it: "
+                f"{listed(evidence.number[silent])}"
+            )
+            remedy = "check its tube, sensor and plug at that time, and the places of these presses"
+            yield Finding(Severity.WARNING, PRESSURE, what, remedy)
+
+
+def _median(values: np.ndarray) -> float:
+    """The median; 0 of nothing."""
+    return float(np.median(values)) if len(values) else 0.0
 
 
 def _order_findings(
