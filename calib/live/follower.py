@@ -33,7 +33,7 @@ class LiveFollower:
         self,
         calibration: Calibration,
         prepare: Prepare = prepare_calibrated_tracker,
-        most: int = TrackerSettings().most,
+        most: int = TrackerSettings.most,  # of the class: an object would start JAX
     ):
         self._calibration, self._prepare, self.most = calibration, prepare, most
         self._tracker: Tracker | None = None
