@@ -14,7 +14,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from ..spelling import did_you_mean
-from .searches import BoundedDescent, DampingSearch, HalfSquares, Parameters, Scalar, normal_equations
+from .searches import BoundedDescent, Cholesky, DampingSearch, HalfSquares, Parameters, Scalar, normal_equations
 
 OPTIONS = frozenset({"lower", "upper", "curvature", "quadratic", "aim", "outlook", "state"})
 """Names of the options of `LevenbergMarquardt`."""
@@ -190,3 +190,14 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Parameters, Any, Any, L
     ) -> tuple[Parameters, Any, dict[str, Any]]:
         """As it is."""
         return y, aux, {}
+
+
+def gauss_newton_solver(fall_rtol: float | Array, fall_atol: float | Array = 0.0) -> LevenbergMarquardt:
+    """Gauss and Newton's method: steps without damping, each halved until the objective falls (Armijo).
+
+    The fit ends with the step that promises a fall of the objective by no more than ``fall_atol + fall_rtol`` of
+    itself.
+    """
+    newton: optx.AbstractDescent[Parameters, Any, Any] = optx.NewtonDescent(linear_solver=Cholesky())
+    ends: dict[str, Any] = {"fall_rtol": fall_rtol, "fall_atol": fall_atol}
+    return LevenbergMarquardt(0.0, 0.0, descent=newton, search=optx.BacktrackingArmijo(), **ends)

@@ -117,6 +117,7 @@ HOST = {
             "chosen",
             "require_limits",
             "default_solver",
+            "from_words",
             "function_space",
             "laid",
             "limited",

@@ -14,7 +14,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._compile import full_precision, verb
-from ...least_squares import Cholesky, ImplicitStep, LeastSquaresState, LevenbergMarquardt, normal_equations, quadratic
+from ...least_squares import ImplicitStep, LeastSquaresState, LevenbergMarquardt, normal_equations, quadratic
+from ...least_squares.levenberg_marquardt import gauss_newton_solver
 from ...least_squares.searches import HalfSquares
 from ...model.bases import BasisMap, Picture
 from ...model.discretisation import Model
@@ -267,9 +268,7 @@ def most_probable(
 
     With ``damped`` by Levenberg and Marquardt's, where the quadratic holds for small steps only.
     """
-    newton: optx.AbstractDescent[Array, Any, Any] = optx.NewtonDescent(linear_solver=Cholesky())
-    choice: dict[str, Any] = {} if damped else {"descent": newton, "search": optx.BacktrackingArmijo()}
-    solver = LevenbergMarquardt(0.0, 0.0, fall_rtol=tolerance, **choice)
+    solver = LevenbergMarquardt(0.0, 0.0, fall_rtol=tolerance) if damped else gauss_newton_solver(tolerance)
     found: optx.Solution[Array, Any] = optx.least_squares(
         lambda x, posterior: posterior.residual(x),
         solver,

@@ -24,7 +24,8 @@ from scipy.linalg import block_diag
 
 from ..._compile import full_precision, is_traced, verb
 from ...effects import CommonMode, chosen
-from ...least_squares import Cholesky, ImplicitStep, LevenbergMarquardt
+from ...least_squares import ImplicitStep
+from ...least_squares.levenberg_marquardt import gauss_newton_solver
 from ...linalg.lapack import eigh
 from ...model.discretisation import Model, require_model
 from ...model.forward_model import forward
@@ -353,11 +354,9 @@ def _most_probable(
         return jnp.append(weight * (known - problem.read(x)), x)
 
     # Damped steps swing from one side of the valley of contacts to the other; halved ones of Gauss and Newton do not.
-    newton: optx.AbstractDescent[Array, Any, Any] = optx.NewtonDescent(linear_solver=Cholesky())
-    choice: dict[str, Any] = {"descent": newton, "search": optx.BacktrackingArmijo()}
     found: optx.Solution[Array, Any] = optx.least_squares(
         residual,
-        LevenbergMarquardt(0.0, 0.0, fall_rtol=TOLERANCE, fall_atol=TOLERANCE, **choice),
+        gauss_newton_solver(TOLERANCE, TOLERANCE),
         start,
         (problem, known, weight),
         max_steps=MAX_STEPS,
