@@ -11,6 +11,7 @@ import pytest
 
 import calib
 import jaxeit as je
+from calib import calibration
 from calib.fitting import CURVES, FIELDS, LOSSES
 from jaxeit.linalg import Dense
 
@@ -218,6 +219,15 @@ def test_a_field(own):
     field = FIELDS.make(f"{own}:Slope", allow_import=True)
     assert FIELDS.text(field) == f"{own}:Slope"
     assert field.size(4) == 1
+
+
+def test_the_page_lists_every_kind_with_its_entry_point_group():
+    page = (Path(__file__).parents[2] / "docs" / "own-classes.md").read_text()
+    rooms = [je.effects, je.skin, je.imaging, je.model, je.linalg, je.scan, calib.fitting, calib.presses, calibration]
+    kinds = [thing for room in rooms for thing in vars(room).values() if isinstance(thing, je.registry.Registry)]
+    listed = re.findall(r"\| `(\w+\.\w+)` \|$", page, re.MULTILINE)
+    assert {kind.group for kind in kinds} <= {*listed}
+    assert len({kind.group for kind in kinds}) > 14
 
 
 class Halved(calib.presses.AbstractCorrection):
