@@ -38,6 +38,7 @@ COMMANDS = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; 0 on success, 2 for bad input with one line on standard error."""
     argv = sys.argv[1:] if argv is None else list(argv)
+    _open_closed_streams()
     try:
         with termination_raised():
             return _run(argv)
@@ -71,6 +72,16 @@ def _run(argv: list[str]) -> int:
         return status
     finally:
         sys.stdout.flush()
+
+
+def _open_closed_streams() -> None:
+    """Give standard streams that are closed, as daemons start programs, the null device, in the order of their numbers.
+
+    Otherwise nothing could be printed, and the first file that is opened would get the number of a standard stream.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115
 
 
 def _with_remedy(error: Exception) -> str:

@@ -35,6 +35,16 @@ def test_the_command_is_also_a_module():
     assert re.fullmatch(r"jaxeit \d+\.\d+\.\d+\n", done.stdout)
 
 
+@pytest.mark.parametrize(
+    ("words", "status"), [("--version >&-", 0), ("check nothing.h5 2>&-", 2), ("check nothing.h5 <&- >&- 2>&-", 2)]
+)
+def test_closed_standard_streams_change_no_status(words, status):
+    command = ["sh", "-c", f'"$0" -m jaxeit {words}', sys.executable]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == status
+    assert "Traceback" not in done.stderr + done.stdout
+
+
 @pytest.fixture(scope="module")
 def presses_file(bundled):
     return next(path for path in bundled if path.stem == "testbed_presses")
