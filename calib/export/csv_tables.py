@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxeit.files import open_regular
+
 from ..calibration.application import FORMAT as FORCE_MAP, TRACKS
 from ..calibration.frame_blocks import Progress
 from ..calibration.logs.procedure import FORCE_FORMAT as LOG_FORCES
@@ -27,6 +29,8 @@ LOG_COLUMNS = {
     "valid": "valid",
 }
 CONTACT_COLUMNS = ["time_s", "number", "x_m", "y_m", "force_N"]
+LOG_HEAD, PAD_HEAD = ["time_s", *LOG_COLUMNS.values()], ["time_s", "total_N"]
+HEAD_BYTES = 256  # enough to hold the columns with which tables begin
 Row = Sequence[object]
 
 
@@ -58,16 +62,17 @@ def export_csv(
 
     Args:
         source: a force map, or the forces of a log.
-        output: replaced if it exists and is no session; the tables appear when they are complete.
+        output: replaced if it exists and is such a table; the tables appear when they are complete.
         progress: wraps what is written piece by piece, as `tqdm.tqdm` does.
 
     Raises:
-        SessionError: for another kind of file, or one that lacks an array; for an output that is the source or a
-            session, which would be lost.
+        SessionError: for another kind of file, or one that lacks an array; for an output, or a second table, in whose
+            place lies the source, a session or another file that is no table of forces, which would be lost.
     """
     source, output = Path(source), Path(output)
     require_no_input(output, [source])
     require_no_session(output)
+    _require_own(output, (LOG_HEAD, PAD_HEAD))
     kind = archive_format(source)
     if kind not in (FORCE_MAP, LOG_FORCES):
         what = f"is {printable(kind)!r}" if kind else "has no format"
@@ -77,6 +82,8 @@ def export_csv(
         tables += [_track_table] if TRACKS + "number" in archive.arrays else []
         tables += [_contact_table] if len(tables) == 1 and "contact_force" in archive.arrays else []
         names = [output.name, output.stem + CONTACTS][: len(tables)]
+        for name in names[1:]:
+            _require_own(output.with_name(name), (CONTACT_COLUMNS,))
         rows = [_write(folder / name, table(archive, progress)) for name, table in zip(names, tables, strict=True)]
         for name in names:
             os.replace(folder / name, output.parent / name)
@@ -85,7 +92,7 @@ def export_csv(
 
 def _log_table(archive: ArchiveReader, progress: Progress) -> Iterator[Row]:
     _require(archive, LOG_COLUMNS)
-    yield ["time_s", *LOG_COLUMNS.values()]
+    yield LOG_HEAD
     for time, *columns in _blocks(archive, ["time", *LOG_COLUMNS], progress):
         yield from zip(_seconds(time), *map(_cells, columns), strict=True)
 
@@ -93,7 +100,7 @@ def _log_table(archive: ArchiveReader, progress: Progress) -> Iterator[Row]:
 def _pad_table(archive: ArchiveReader, progress: Progress) -> Iterator[Row]:
     _require(archive, ["pad_names", *PAD_COLUMNS])
     pads = [str(name) for name in archive.arrays["pad_names"].read().tolist()]
-    yield ["time_s", "total_N", *(f"{pad} {label}" for pad in pads for label in PAD_COLUMNS.values())]
+    yield [*PAD_HEAD, *(f"{pad} {label}" for pad in pads for label in PAD_COLUMNS.values())]
     for time, *columns in _blocks(archive, ["time", *PAD_COLUMNS], progress):
         each = [_cells(column[:, pad]) for pad in range(len(pads)) for column in columns]
         yield from zip(_seconds(time), _cells(columns[0].sum(1)), *each, strict=True)
@@ -118,6 +125,16 @@ def _contact_table(archive: ArchiveReader, progress: Progress) -> Iterator[Row]:
         frame, number = np.nonzero(np.isfinite(place).all(2))
         columns = (number, *place[frame, number].T, force[frame, number])
         yield from zip(_seconds(time[frame]), *map(_cells, columns), strict=True)
+
+
+def _require_own(path: Path, heads: Iterable[Sequence[str]]) -> None:
+    """Refuse a path at which a file lies that does not begin with one of these columns: it may be a log."""
+    if not path.is_file():
+        return
+    with open_regular(path) as file:
+        begin = file.read(HEAD_BYTES)
+    if begin and not any(begin.startswith(",".join(head).encode()) for head in heads):
+        raise problem(path, "file", "is no table of forces, and would be lost", "give another name for the output")
 
 
 def _require(archive: ArchiveReader, names: Iterable[str]) -> None:

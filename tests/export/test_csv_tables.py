@@ -107,3 +107,19 @@ def test_neither_the_force_map_nor_a_session_is_replaced(tmp_path, bundled):
         with pytest.raises(SessionError, match=f"{output.name}: file: {words}.*, which would be lost; give another"):
             export_csv(tmp_path / "map.h5", output)
         assert output.read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["log.csv", "log-contacts.csv"])
+def test_only_tables_of_forces_are_replaced(name, tmp_path, capsys):
+    """The second table, which nobody names, takes the place of no other file either."""
+    place, force = np.full((FRAMES, 1, 2), 0.1), np.full((FRAMES, 1), 7.0)
+    archive(tmp_path / "map.h5", contact_position=place, contact_force=force)
+    command = ["export", "csv", str(tmp_path / "map.h5"), "-o", str(tmp_path / "log.csv")]
+    assert main(command) == main(command) == 0
+    (tmp_path / name).write_text("t,f\n0,1\n")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    capsys.readouterr()
+    assert main(command) == 2
+    said = f"{name}: file: is no table of forces, and would be lost; give another name for the output"
+    assert said in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

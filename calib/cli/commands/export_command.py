@@ -38,7 +38,7 @@ def _add_bag(bag: argparse.ArgumentParser) -> None:
 
 def _add_forces(forces: argparse.ArgumentParser) -> None:
     forces.add_argument("source", metavar="FORCEMAP.h5", help="a force map of jaxeit apply, or the forces of a log")
-    text = "contacts are written to a second table beside it, FORCES-contacts.csv"
+    text = "contacts are written to a second table beside it, FORCES-contacts.csv; other files are not replaced"
     forces.add_argument("-o", "--output", required=True, metavar="FORCES.csv", help=text)
 
 
