@@ -32,7 +32,7 @@ from ..session.given import require_session, require_skin_or_none, sessions_of
 from .archives.storage import describe
 from .calibration import Calibration
 from .evaluation import Evaluation, centre_of
-from .fitted_sessions import FITTED, is_fitted, require_each_once
+from .fitted_sessions import FITTED, holds_presses, is_fitted, require_each_once
 from .given import require_calibration, require_no_eit_choices
 from .hysteresis_loops import typical_loops
 from .layer import learn_layer
@@ -294,8 +294,8 @@ def evaluate(
 
 def _evaluation(calibration: Calibration, session: Session, processing: Processing, ignore_errors: bool) -> Evaluation:
     """`evaluate` for the calibration of a skin."""
-    fitted = is_fitted(calibration.provenance, session)
     found = measure(session, calibration.skin, processing)
+    fitted = is_fitted(calibration.provenance, session) or holds_presses(calibration, found.force, found.pressure)
     ignored = accept([session], calibration.skin, ignore_errors=ignore_errors)
     _require_channels(calibration, found)
     images = Imager(calibration.recon, calibration.masks, calibration.locator).presses(found.dv)

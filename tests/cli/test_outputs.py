@@ -9,7 +9,7 @@ import pytest
 
 import calib
 import jaxeit as je
-from calib.calibration.fitted_sessions import is_fitted
+from calib.calibration.fitted_sessions import is_fitted, require_each_once
 from calib.cli import main
 from calib.session import SessionError, file_hash, open_session
 
@@ -136,6 +136,32 @@ def test_a_recording_is_given_once(files, monkeypatch, capsys):
     for again in ("session.h5", "copy.h5"):
         assert main(["calibrate", "session.h5", again, "-o", "new.h5"]) == 2
         assert f"{again}: is the recording of session.h5 again" in capsys.readouterr().err
+
+
+def renamed(path, copy):
+    """A copy of a session with another identity, as one that is written or imported again has."""
+    shutil.copy(path, copy)
+    with h5py.File(copy, "r+") as file:
+        file.attrs["session_id"] = np.bytes_("another one")
+    return str(copy)
+
+
+def test_a_recording_of_another_identity_is_given_once(files, monkeypatch, capsys):
+    monkeypatch.chdir(files)
+    assert main(["calibrate", "session.h5", renamed("session.h5", "copy.h5"), "-o", "new.h5"]) == 2
+    said = "copy.h5: holds the samples of session.h5 again under another session_id; give each recording once"
+    assert said in capsys.readouterr().err
+
+
+def test_presses_that_were_fitted_are_known_in_a_copy_of_another_identity(calibration, bundled, tmp_path):
+    for path in bundled:
+        with open_session(renamed(path, tmp_path / "copy.h5")) as copy:
+            assert calib.evaluate(calibration, copy).held_out_by == ("" if path.stem == "testbed_grid" else "session")
+
+
+def test_sessions_of_one_bench_are_no_copies(bundled):
+    with open_session(bundled[0]) as one, open_session(bundled[1]) as two:
+        require_each_once([one, two])
 
 
 def test_presses_that_were_fitted_are_not_called_held_out(calibration, bundled, capsys, tmp_path):
