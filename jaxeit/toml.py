@@ -236,7 +236,8 @@ class TomlTable:
         """Raise a `TomlError` for the first key that was not read, naming the nearest known key."""
         for key in self._values:
             if key not in self._asked:
-                hint = did_you_mean(key, self._asked, "known: " + ", ".join(sorted(self._asked)))
+                known = f"known: {', '.join(sorted(self._asked))}" if self._asked else "leave it out: there are no keys"
+                hint = did_you_mean(key, self._asked, known)
                 raise self.error(SHORT_REPR.repr(key)[1:-1], f"unknown key; {hint}")
 
 

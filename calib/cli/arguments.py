@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import errno
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar, overload
@@ -107,6 +108,7 @@ def prepare_outputs(args: argparse.Namespace, *names: str) -> None:
     outputs = [Path(path) for name in names if (path := getattr(args, name))]
     inputs = [Path(word) for name, value in vars(args).items() if name not in names for word in _words(value)]
     for number, path in enumerate(outputs):
+        _require_short_name(path)
         if path.is_dir():
             raise ValueError(f"{path}: is a folder; give a file name")
         if path.exists() and not path.is_file():
@@ -118,6 +120,15 @@ def prepare_outputs(args: argparse.Namespace, *names: str) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         if not os.access(path.parent, os.W_OK):
             raise ValueError(f"{path}: the folder cannot be written to; choose another")
+
+
+def _require_short_name(path: Path) -> None:
+    """Refuse a name that is too long for a file, or for the unfinished file beside it."""
+    try:
+        os.stat(path.parent / f".{path.name}.{'0' * 12}.tmp")
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise ValueError(f"{path.name[:40]}...: is too long for the name of a file; give a shorter one") from None
 
 
 def prepare_results(args: argparse.Namespace, *names: str) -> None:

@@ -69,10 +69,10 @@ def assign_folds(groups: Numbers, folds: int = 5, seed: int = 0) -> np.ndarray:
     """
     labels, index = np.unique(groups, return_inverse=True)
     if folds < 2 or len(labels) < folds:
-        raise FitError(
-            f"cannot divide {len(labels)} presses or locations into {folds} folds: choose at least 2 folds, "
-            "and at most one for each press or location."
-        )
+        todo = "choose at least 2 folds" if len(labels) > 1 else "press two or more places"
+        if folds > len(labels) > 1:
+            todo = "choose at most one fold for each press or location"
+        raise FitError(f"cannot divide {len(labels)} presses or locations into {folds} folds: {todo}")
     order = np.random.default_rng(seed).permutation(len(labels))
     return (order % folds)[index.reshape(-1)]
 

@@ -42,7 +42,11 @@ def load_tank(
             raise TankError(f'{type(skin).__name__} is not a skin; make one, such as jaxeit.load_skin("tank.toml")')
         return described_tank(path, skin)
     if path.is_dir():
-        return load_sciospec(sorted(path.glob("*.eit")), domain, rim)
+        if not (frames := sorted(path.glob("*.eit"))):
+            raise TankError(
+                f"{path}: is a folder without .eit files; give a file, or a folder of Sciospec's files"
+            )
+        return load_sciospec(frames, domain, rim)
     kind = path.suffix.lower()
     if kind == ".mat":
         variables = read_matlab(path)

@@ -123,7 +123,7 @@ def sciospec_tank(paths: Sequence[Path], domain: Domain | None, rim: Sequence[Ab
         frames.append(potentials)
         names.append(path.stem)
     if first is None:
-        raise TankError("no .eit file was given")
+        raise TankError("no .eit file was given; give one or more files of Sciospec's software")
     drives, current, frequency = first
     electrodes = frames[0].shape[1]
     ring = np.stack([np.arange(electrodes), (np.arange(electrodes) + 1) % electrodes], 1)

@@ -165,7 +165,7 @@ def test_parts_and_percents_are_no_multiples(capsys, words, said):
         (["--move", "--distance", "0.05"], "the electrodes break the limits where they sit now, by 10 mm"),
         (["--readings", "46"], "there are 45 candidates"),
         (["--rate", "1e6"], "a reading alone takes 1e-05 s; give a lower rate"),
-        (["--criterion", "best"], 'no criterion \'best\'; give one of "place-error", "d-optimal"'),
+        (["--criterion", "best"], '--criterion: no criterion \'best\'; give one of "place-error", "d-optimal"'),
         (["--criterion", "place-error:power=-1"], "power"),
         (["--readings", "46", "--switch", "0", "--relative-noise", "0"], "there are 45 candidates"),
         (["--readings", "12", "--width", "1e-9"], "--width 1e-09: too narrow for the model's mesh; give at least 0.00"),

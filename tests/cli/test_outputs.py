@@ -70,6 +70,14 @@ def test_no_output_takes_the_place_of_a_device(files, monkeypatch, capsys, calib
     assert Path("/dev/null").is_char_device()
 
 
+@pytest.mark.parametrize("length", [240, 300])
+def test_a_name_that_is_too_long_is_said_before_the_work_begins(length, files, monkeypatch, capsys):
+    monkeypatch.chdir(files)
+    assert main(["calibrate", "session.h5", "-o", length * "x"]) == 2
+    said = f"jaxeit: {40 * 'x'}...: is too long for the name of a file; give a shorter one\n"
+    assert capsys.readouterr().err == said
+
+
 def test_no_two_outputs_have_one_name(files, monkeypatch, capsys):
     monkeypatch.chdir(files)
     assert main(["calibrate", "session.h5", "-o", "new.h5", "--report", "./new.h5"]) == 2

@@ -82,6 +82,7 @@ def test_settings_are_given_in_a_word(registry, text, again):
         (BASES, "pixels:columns=0", "Pixels: columns is 0; give 1 to 2000, a whole number"),
         (LOCATORS, "fitted-contact:widths=[1,2,3]", r"give \[a number, a number\] such as \[0.006,0.03\]"),
         (HYPERPARAMETERS, "l-curve:frames=1", "frames: unknown key"),
+        (CURVES, "linear:bogus=3", "'linear:bogus=3': bogus: unknown key; leave it out: there are no keys$"),
         (EFFECTS, "Noise:stream=eeg", 'give one of "eit", "pressure", "force"'),
         (EFFECTS, "CoatingNonUniformity:field=1", "field: unknown key"),
         (EFFECTS, "CoatingNonUniformity:length=x", "such as 0.03 .length of correlation, 10 to 60 mm."),

@@ -371,6 +371,11 @@ def test_other_files_are_refused(tmp_path, name, content, message):
         load_tank(tmp_path / name, je.Disc(RADIUS))
 
 
+def test_a_folder_without_frames_is_named(tmp_path):
+    with pytest.raises(TankError, match=f"{tmp_path}: is a folder without .eit files; give a file, or a folder of"):
+        load_tank(tmp_path, je.Disc(RADIUS))
+
+
 @pytest.mark.slow
 def test_the_page_goes_from_a_file_to_a_picture(bench, tmp_path, root, monkeypatch, capsys):
     """At most ten lines; the same from the command line."""
