@@ -249,6 +249,17 @@ def frozen(name, first, last, numbers=slice(None)):
     return tell
 
 
+def cells(name, value):
+    """Single cells in a hundred hold a value that stands for no reading."""
+
+    def tell(r):
+        values = r.values(name).copy()
+        values[np.random.default_rng(1).random(values.shape) < 0.01] = value
+        return r.change(name, values)
+
+    return tell
+
+
 def at_rest(name):
     """A stream shows its rest for ever, with its noise."""
 
@@ -591,9 +602,28 @@ LIES = {
         ERROR,
         ("/streams/force", "no finite value"),
     ),
+    "values of single pads 65535, without a reading": Lie(
+        cells("pressure", 65535.0), WARNING, ("/streams/pressure", "single values are one and the same", "in column 2")
+    ),
+    "frames of force 999, without a reading": Lie(
+        cells("force", 999.0), WARNING, ("/streams/force", "single frames are one and the same, all 999")
+    ),
     "pressure without force": Lie(unpressed, WARNING, ("without force",)),
     "force outside the listed presses": Lie(half_listed, WARNING, ("outside the listed presses", "8 contacts")),
 }
+
+
+def test_a_hum_is_no_value_for_missing_ones(honest, findings):
+    """Its extremes repeat to the last digit; one value for no reading stands by far the most often."""
+    force = honest.values("force")
+    hum = 5 * np.round(np.sin(2 * np.pi * 0.4 * np.arange(len(force))), 2)[:, None]
+    assert not [found for found in findings(honest.change("force", force + hum)) if "one and the same" in found.what]
+
+
+def test_a_jump_of_a_day_is_no_wrong_unit(honest, findings):
+    found = findings(jump("force", 86400.0)(honest))
+    assert any("1 gap, the longest of 8.64e+04 s" in one.what for one in found)
+    assert not any("another unit" in one.what for one in found)
 
 
 @pytest.mark.parametrize("lie", LIES)
@@ -604,6 +634,29 @@ def test_a_lie_is_named(lie, honest, findings, hard):
     named = [text for text in texts if all(word in text for word in words)]
     assert named, found
     hard(f"lie: {lie}", f"`check`: {severity.name.lower()}", beyond=named[0])
+
+
+def test_pressures_that_are_late_by_a_press_are_named(skin):
+    """Presses come at even times, so that the streams correlate as they are."""
+    rng = np.random.default_rng(2)
+    site = np.array([[0.05, 0.05], [0.15, 0.05], [0.05, 0.15], [0.15, 0.15]])[rng.permutation(24) % 4]
+    pressure = np.where(pads_under(skin, site).T, 800.0, 5.0)
+
+    def named(values):
+        evidence = stand_in(
+            PressEvidence,
+            number=np.arange(24),
+            site=site,
+            force=np.full(24, 10.0),
+            pressure=values,
+            times=np.arange(24) * SECOND,
+        )
+        return [found.what for found in pad_response_findings(evidence, skin, 0)]
+
+    assert named(pressure) == []
+    for rows, said in ((1, "1 press late: 100% of"), (-2, "2 presses early: 100% of")):
+        (what,) = named(np.roll(pressure, rows, 0))
+        assert f"the pads respond {said} the presses so moved" in what
 
 
 def test_a_pad_that_dies_is_named_where_pads_beside_it_bear_a_part(skin):

@@ -14,6 +14,9 @@ from .places import pads_under
 PRESSURE = "/streams/pressure"
 MIN_PAD_RESPONSE = 0.05  # of the usual change of pressure per newton: a press below it is not felt
 MAX_BESIDE = 0.5  # of the usual response of all pads: less is what pads beside the pressed one bear
+# Rows by which pressures may be late as a whole; and presses that tell it, the share of them that agrees then, and by
+# how much more agree than as listed.
+MAX_LATE_ROWS, MIN_LATE_PRESSES, MIN_LATE_SHARE, MIN_LATE_GAIN = 5, 8, 0.9, 0.15
 MIN_PRESSES_PER_PAD = 3  # from so many presses on, each pad should have been pressed
 MIN_PRESSES = 2  # on one pad, from which its sign or its scale is known
 MIN_STRONGER = 3.0  # times its own pad's response: another column that responds so is that pad's
@@ -49,7 +52,9 @@ def pad_response_findings(evidence: PressEvidence, skin: je.Skin, start: int) ->
         yield from _silent_findings(evidence, skin, size / force[:, None], np.where(known, -1, alone))
     falling = [*_falling_findings(evidence, skin, strongest, largest, start)]
     yield from falling
-    if under.size and not falling:
+    late = [] if falling else [*_late_findings(evidence, alone, size)]
+    yield from late
+    if under.size and not falling and not late:
         yield from _order_findings(evidence, skin, alone, np.nan_to_num(pressure), strongest, start)
         yield from _idle_findings(skin, alone)
 
@@ -122,6 +127,35 @@ def _unfelt_findings(evidence: PressEvidence, response: np.ndarray, known: np.nd
         what = f"no pad feels {len(rows)} of {len(response)} presses that have force: {listed(rows)}"
         remedy = "check the tubes of the pads, and that the pressure stream did not stand still"
         yield Finding(Severity.WARNING, PRESSURE, what, remedy)
+
+
+def _late_findings(evidence: PressEvidence, alone: np.ndarray, size: np.ndarray) -> Iterator[Finding]:
+    """Pressures that fit the presses some rows before or after, as of a stream that is late by a whole press.
+
+    Args:
+        alone: pad under the tip, (presses,); -1: none, or several.
+        size: of the pressures, (presses, pads) Pa.
+    """
+    agreed = {rows: _agreement(alone, size, rows) for rows in range(-MAX_LATE_ROWS, MAX_LATE_ROWS + 1)}
+    best = max(agreed, key=lambda rows: (agreed[rows], -abs(rows)))
+    if best and agreed[best] >= MIN_LATE_SHARE and agreed[0] <= agreed[best] - MIN_LATE_GAIN:
+        presses = f"{counted(abs(best), 'press', 'presses')} {'late' if best > 0 else 'early'}"
+        what = (
+            f"the pads respond {presses}: {agreed[best]:.0%} of the presses so moved lie on the pad that responds "
+            f"most, and {agreed[0]:.0%} as listed"
+        )
+        remedy = "compare the clock of the pressures with the others, and move its time stamps at import"
+        yield Finding(Severity.ERROR, PRESSURE, what, remedy)
+
+
+def _agreement(alone: np.ndarray, size: np.ndarray, rows: int) -> float:
+    """Share of the presses that lie on the pad that responds most so many rows later; 0 of few presses or pads."""
+    pads_of, read = (alone[: len(alone) - rows], size[rows:]) if rows >= 0 else (alone[-rows:], size[:rows])
+    known = pads_of >= 0
+    if known.sum() < MIN_LATE_PRESSES or len(np.unique(pads_of[known])) < 2:
+        return 0.0
+    strongest = np.where(read.max(1) > MIN_PAD_RESPONSE * np.median(size.max(1)), read.argmax(1), -1)
+    return float(np.mean(strongest[known] == pads_of[known]))
 
 
 def _silent_findings(
