@@ -216,9 +216,11 @@ class Reconstructor(AbstractReconstructor):
         It works in ``dtype``, except that missing readings are replaced in the reconstructor's own precision.
 
         Raises:
-            InverseError: where jit, grad or vmap hides the numbers of the reconstructor.
+            InverseError: where jit, grad or vmap hides the numbers of the reconstructor; for another precision.
         """
         require_known("on_host", InverseError, self)
+        if dtype is not None and dtype not in ("float32", "float64"):
+            raise InverseError(f"on_host: dtype is {dtype!r}; give 'float32' or 'float64'")
         return NumpyImages(self.factor, self.predict, self.whitening, dtype or str(self.factor.dtype))
 
     def astype(self, dtype: str) -> "Reconstructor":

@@ -113,6 +113,8 @@ def test_numpy_gives_the_same_image(recon):
         _same_in_numpy(recon, frames)
     with pytest.raises(je.imaging.InverseError, match="must hold 550"):
         recon.on_host()(np.zeros(3))
+    with pytest.raises(je.imaging.InverseError, match=r"^on_host: dtype is 'float16'; give 'float32' or 'float64'$"):
+        recon.on_host("float16")
 
 
 def test_a_vmap_over_whole_frames_solves_nothing(recon):
