@@ -181,16 +181,25 @@ class Calibration:
         """Precision of the fitted curves."""
         return self.curves.parameters.dtype
 
+    def __repr__(self) -> str:
+        found = self.evaluation
+        error = f"{found.held_out}, RMSE {self._force_error}"
+        return f"Calibration({self.skin.name!r}, {len(found.force)} presses, {found.recipe!r}, {error})"
+
+    @property
+    def _force_error(self) -> str:
+        error = self.evaluation.total_force - self.evaluation.force
+        return f"{np.sqrt(np.nanmean(error**2)):.3g} N"
+
     def _repr_html_(self) -> str:
         found = self.evaluation
-        error = found.total_force - found.force
         places = found.estimated.get("fitted", found.estimated.get("half"))
         sessions = [line.split("  ")[-1] for line in self.provenance.get("sessions", "").splitlines()]
         rows = [
             ("sessions", ", ".join(sessions)),
             ("presses", f"{len(found.force)}" + (", simulated" if self.simulated else "")),
             ("curve, location", found.recipe),
-            (f"error of force, {found.held_out}", f"{np.sqrt(np.nanmean(error**2)):.3g} N, RMSE"),
+            (f"error of force, {found.held_out}", f"{self._force_error}, RMSE"),
         ]
         if places is not None:
             distance = np.linalg.norm(places - found.position, axis=1)

@@ -43,9 +43,7 @@ def load_tank(
         return described_tank(path, skin)
     if path.is_dir():
         if not (frames := sorted(path.glob("*.eit"))):
-            raise TankError(
-                f"{path}: is a folder without .eit files; give a file, or a folder of Sciospec's files"
-            )
+            raise TankError(f"{path}: is a folder without .eit files; give a file, or a folder of Sciospec's files")
         return load_sciospec(frames, domain, rim)
     kind = path.suffix.lower()
     if kind == ".mat":

@@ -1,5 +1,6 @@
 """Nothing that cannot be made again is lost: outputs take the place of no input and of no recording."""
 
+import re
 import shutil
 from pathlib import Path
 
@@ -127,6 +128,11 @@ def test_an_import_takes_the_place_of_an_import_but_of_no_recording(files, monke
     assert main([*command, "session.h5"]) == 2
     assert "session.h5: file: holds a recording, which would be lost; give another name" in capsys.readouterr().err
     assert file_hash("session.h5") == before
+
+
+def test_a_calibration_is_shown_in_one_line(calibration):
+    form = r"Calibration\('testbed', 225 presses, '.+', held out by location, RMSE [\d.]+ N\)"
+    assert re.fullmatch(form, repr(calibration))
 
 
 def test_a_calibration_is_not_saved_over_a_session(calibration, files):

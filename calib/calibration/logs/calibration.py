@@ -59,6 +59,10 @@ class LogCalibration:
     why: str = ""
     tried: tuple[Candidate, ...] = ()
 
+    def __repr__(self) -> str:
+        channels = f"{len(self.kept)} of {self.columns}"
+        return f"LogCalibration({self.stream!r} in {self.unit}, channels={channels}, curve={self.curve_name!r})"
+
     def predict(
         self,
         time: ArrayLike,

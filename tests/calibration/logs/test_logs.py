@@ -1,5 +1,6 @@
 """Calibrations of logs: channels left out, files, evaluation, application, and logs of one sensor together."""
 
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -247,6 +248,7 @@ def test_a_tracker_refuses_impossible_readings_and_goes_on(sensor):
 def test_logs_of_one_sensor_are_pooled_and_others_refused(array, few, tmp_path):
     with open_session(few[0]) as one, open_session(few[1]) as two:
         both = calibrate_logs([one, two], LINEAR)
+        assert re.fullmatch(r"LogCalibration\('.+' in Pa, channels=1 of 1, curve='linear'\)", repr(both))
         assert evaluate_log(both, two).valid.all()
         assert both.provenance["sessions"].count("\n") == 1
     other = write_log(tmp_path / "other.h5", array[0], array[1][:, :3])
