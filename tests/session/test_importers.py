@@ -169,6 +169,15 @@ def test_repeated_times_are_dropped_and_backward_ones_need_sort(tmp_path: Path) 
     np.testing.assert_array_equal(stream(tmp_path, "f")[:, 0], [1, 2, 5, 4])
 
 
+def test_a_clock_of_whole_seconds_is_pointed_out(tmp_path: Path) -> None:
+    path = table(tmp_path, "".join(f"{k // 20},{k}\n" for k in range(400)))
+    said = load(path, "--time", "0:s", "--stream", "f=1:N", folder=tmp_path).warnings[0]
+    assert said.startswith(
+        "log.csv: 380 of 400 rows are left out, since they have the time of another: if the clock is"
+    )
+    assert said.endswith("give the rate of the rows in its place (about --rate 20)")
+
+
 def test_sentinels_are_pointed_out_but_resting_values_are_not() -> None:
     rng = np.random.default_rng(0)
     force = np.linspace(0, 50, 1000) + rng.normal(size=1000)

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
+MAX_EQUAL_TIMES = 0.2  # share of the rows that may have the time of another: more tell of a clock that is too coarse
+
 
 @dataclass(frozen=True)
 class StreamReport:
@@ -84,7 +86,7 @@ class ImportReport:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings that the user should act on, one line each."""
-        found = [w for f in self.files for s in f.streams for w in s.warnings]
+        found = [w for f in self.files for w in (*_clock_warnings(f), *(w for s in f.streams for w in s.warnings))]
         if not self.epoch_known:
             found.append("the clock does not say when the recording began; give --epoch if known")
         return (*found, *self.notes)
@@ -94,6 +96,16 @@ class ImportReport:
         lines = [line for f in self.files for line in _file_lines(f)]
         lines += [f"warning: {w}" for w in self.warnings]
         return "\n".join([*lines, f"wrote {self.output}"])
+
+
+def _clock_warnings(report: FileReport) -> Iterator[str]:
+    """What to do about a clock with fewer times than there are rows, as one of whole seconds."""
+    timed = report.rows_read - report.rows_without_time
+    if report.equal_times > MAX_EQUAL_TIMES * timed:
+        rate = max((s.rate_hz for s in report.streams), default=0.0) * timed / (timed - report.equal_times)
+        what = f"{report.equal_times:,} of {timed:,} rows are left out, since they have the time of another"
+        todo = f"give the rate of the rows in its place (about --rate {rate:.3g})"
+        yield f"{report.path.name}: {what}: if the clock is coarse, as one of whole seconds, {todo}"
 
 
 def _file_lines(report: FileReport) -> Iterator[str]:
