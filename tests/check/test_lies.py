@@ -616,7 +616,7 @@ LIES = {
 def test_a_hum_is_no_value_for_missing_ones(honest, findings):
     """Its extremes repeat to the last digit; one value for no reading stands by far the most often."""
     force = honest.values("force")
-    hum = 5 * np.round(np.sin(2 * np.pi * 0.4 * np.arange(len(force))), 2)[:, None]
+    hum = 5 * np.round(np.sin(2 * np.pi * 0.503 * np.arange(len(force))), 2)[:, None]
     assert not [found for found in findings(honest.change("force", force + hum)) if "one and the same" in found.what]
 
 
