@@ -122,11 +122,15 @@ def _size_findings(skin: je.Skin) -> Iterator[Finding]:
 
 
 def _overlap_findings(skin: je.Skin) -> Iterator[Finding]:
-    """Pads that lie over one another in part, which air-tight pads beside one another do not."""
+    """Pads that lie over one another in part, which air-tight pads beside one another do not.
+
+    They can be calibrated: where pads overlap, each has an equal share of the image.
+    """
+    todo = "correct the corners, unless the pads do overlap: each then has an equal share of the image there"
     for first, second in combinations(skin.pads, 2):
         if (share := je.skin.pad_overlap(first, second)) > MAX_OVERLAP:
             what = f"{100 * share:.0f} % of pad {first.name!r} or {second.name!r} lie within the other one"
-            yield Finding(Severity.WARNING, "/device", what, "correct the corners: each point of a sheet has one pad")
+            yield Finding(Severity.WARNING, "/device", what, todo)
 
 
 def _share_beyond(pad: je.Pad, hull: np.ndarray, pitch: float) -> float:

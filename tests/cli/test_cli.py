@@ -186,6 +186,7 @@ def test_check_of_a_skin_file_says_what_can_hardly_be(tmp_path, skin, capsys):
     said = capsys.readouterr().out
     assert "1 of 2 readings are taken more than once, as that of electrodes 0, 1, 2, 3" in said
     assert "50 % of pad 'upper left' or 'upper right' lie within the other one" in said
+    assert "unless the pads do overlap: each then has an equal share of the image there" in " ".join(said.split())
     assert "Nothing wrong" not in said
 
 
