@@ -636,27 +636,28 @@ def test_a_lie_is_named(lie, honest, findings, hard):
     hard(f"lie: {lie}", f"`check`: {severity.name.lower()}", beyond=named[0])
 
 
+def found_by_pads(skin, site, pressure):
+    """What is said of pressures (24, pads) of presses of 10 N at places (24, 2)."""
+    numbers = np.arange(24)
+    held = {
+        "number": numbers,
+        "site": site,
+        "force": np.full(24, 10.0),
+        "pressure": pressure,
+        "times": numbers * SECOND,
+    }
+    return [*pad_response_findings(stand_in(PressEvidence, **held), skin, 0)]
+
+
 def test_pressures_that_are_late_by_a_press_are_named(skin):
     """Presses come at even times, so that the streams correlate as they are."""
     rng = np.random.default_rng(2)
     site = np.array([[0.05, 0.05], [0.15, 0.05], [0.05, 0.15], [0.15, 0.15]])[rng.permutation(24) % 4]
     pressure = np.where(pads_under(skin, site).T, 800.0, 5.0)
-
-    def named(values):
-        evidence = stand_in(
-            PressEvidence,
-            number=np.arange(24),
-            site=site,
-            force=np.full(24, 10.0),
-            pressure=values,
-            times=np.arange(24) * SECOND,
-        )
-        return [found.what for found in pad_response_findings(evidence, skin, 0)]
-
-    assert named(pressure) == []
+    assert found_by_pads(skin, site, pressure) == []
     for rows, said in ((1, "1 press late: 100% of"), (-2, "2 presses early: 100% of")):
-        (what,) = named(np.roll(pressure, rows, 0))
-        assert f"the pads respond {said} the presses so moved" in what
+        (found,) = found_by_pads(skin, site, np.roll(pressure, rows, 0))
+        assert f"the pads respond {said} the presses so moved" in found.what
 
 
 def test_a_pad_that_dies_is_named_where_pads_beside_it_bear_a_part(skin):
@@ -664,21 +665,8 @@ def test_a_pad_that_dies_is_named_where_pads_beside_it_bear_a_part(skin):
     site = np.array([[0.09, 0.09], [0.03, 0.03], [0.15, 0.03], [0.03, 0.15]] * 6)
     under = pads_under(skin, site)
     pressure = np.where(under.T, 800.0, 20.0)
-    own = int(under[:, 0].argmax())
-    dead = np.where((np.arange(24)[:, None] >= 12) & (np.arange(4) == own), 0.3, pressure)
-
-    def named(values):
-        evidence = stand_in(
-            PressEvidence,
-            number=np.arange(24),
-            site=site,
-            force=np.full(24, 10.0),
-            pressure=values,
-            times=np.arange(24) * SECOND,
-        )
-        return [*pad_response_findings(evidence, skin, 0)]
-
-    assert not [found for found in named(pressure) if "feel" in found.what]
-    (found,) = [found for found in named(dead) if "feel" in found.what]
+    dying = (np.arange(24)[:, None] >= 12) & (np.arange(4) == under[:, 0].argmax())
+    assert not [found for found in found_by_pads(skin, site, pressure) if "feel" in found.what]
+    (found,) = [one for one in found_by_pads(skin, site, np.where(dying, 0.3, pressure)) if "feel" in one.what]
     assert found.severity is WARNING
     assert re.search(r"column \d, pad '.*', does not feel 6 of 12 presses on it: 12, 13", found.what)
