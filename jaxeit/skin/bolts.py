@@ -10,7 +10,7 @@ from ..meshing.elements import Space
 from ..meshing.outlines import DiscFootprint
 from ..toml import TomlTable
 from .electrodes import AbstractAreaElectrode, require_contact, require_covered, require_positive
-from .places import read_area_contact, read_positions_inside
+from .places import read_area_contact, read_positions_inside, read_radius
 
 LEAST_TRANSFER = 0.1
 """Transfer length, over the distance between unknowns under a bolt, below which its contact is in closed form."""
@@ -74,6 +74,6 @@ class AreaPatch(AbstractAreaElectrode):
     @classmethod
     def read(cls, table: TomlTable, domain: Domain) -> tuple["AreaPatch", ...]:
         positions = read_positions_inside(table, domain)
-        radius = table.positive("radius", "the contact radius in m")
+        radius = read_radius(table, "radius", "the contact radius in m", domain)
         contact = read_area_contact(table)
         return tuple(cls(position, radius, contact) for position in positions)

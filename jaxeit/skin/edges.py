@@ -61,7 +61,8 @@ class BoundaryPatch(AbstractElectrode):
         direction = table.choice("direction", "counter-clockwise", "clockwise", default="counter-clockwise")
         contact = read_contact(table, "ohm m")
         if count * width > domain.perimeter:
-            raise table.error("width", f"{count} electrodes of {width} m do not fit along the edge")
+            fits = f"do not fit along the edge of {domain.perimeter:g} m; give fewer or narrower ones"
+            raise table.error("width", f"{count} electrodes of {width} m {fits}")
         step = domain.perimeter / count * (1 if direction == "counter-clockwise" else -1)
         starts = (first - 0.5 * width + step * np.arange(count)) % domain.perimeter
         return tuple(cls(float(start), float(start + width), contact) for start in starts)

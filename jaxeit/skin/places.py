@@ -8,6 +8,7 @@ from ..toml import TomlError, TomlTable
 
 # ohm m^2, or ohm m on the rim: a bolt of 3 mm radius then has 350 megohm, as one that is not connected.
 MAX_CONTACT = 1e4
+MIN_RADIUS = 1e-4  # of the shorter side of the sheet
 
 
 def read_positions(table: TomlTable) -> list[tuple[float, float]]:
@@ -33,6 +34,14 @@ def read_positions_inside(table: TomlTable, domain: Domain) -> list[tuple[float,
         hint = "give pitch and origin in m, or list positions = [[x, y], ...] where the sheet is no rectangle"
         raise table.error("grid", f"{problem}; {hint}")
     return positions
+
+
+def read_radius(table: TomlTable, key: str, meaning: str, domain: Domain) -> float:
+    """A radius of electrodes on the sheet, m; one of a ten-thousandth of the sheet's width was given in km."""
+    radius, width = table.positive(key, meaning), float(np.ptp(domain.bounds, 0).min())
+    if radius < MIN_RADIUS * width:
+        raise table.error(key, f"is {radius:g} m, too little for electrodes of a sheet of {width:g} m; give {meaning}")
+    return radius
 
 
 def read_area_contact(table: TomlTable) -> float:

@@ -19,7 +19,7 @@ from .electrodes import (
     require_covered,
     require_positive,
 )
-from .places import read_area_contact, read_positions_inside
+from .places import read_area_contact, read_positions_inside, read_radius
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ class RingPatch(AbstractAreaElectrode):
     def read(cls, table: TomlTable, domain: Domain) -> tuple["RingPatch", ...]:
         positions = read_positions_inside(table, domain)
         inner = table.positive("inner_radius", "the radius of the hole in m")
-        outer = table.positive("outer_radius", "the radius of the whole in m")
+        outer = read_radius(table, "outer_radius", "the radius of the whole in m", domain)
         if outer <= inner:
             raise table.error("outer_radius", f"is {outer} m, not above the inner radius, {inner} m")
         contact = read_area_contact(table)

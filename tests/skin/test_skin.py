@@ -75,6 +75,11 @@ def test_a_copied_and_edited_file(tmp_path):
             "no part of the pad lies on the",
         ),
         ("current = 1e-3", "current = 0", "current"),
+        (
+            "radius = 0.003",
+            "radius = 3e-6",
+            r"\[electrodes\]: radius: is 3e-06 m, too little for electrodes of a sheet of",
+        ),
         ("version = 1", "version = 2", "version: is 2"),
         ('format = "jaxeit-skin"', 'format = "other"', "format"),
         ("rectangle = [0.0, 0.0, 0.1, 0.1]", "rectangle = [0.1, 0.0, 0.0, 0.1]", r"\[\[pads\]\] number 1"),
