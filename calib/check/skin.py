@@ -16,7 +16,8 @@ RIM_POINTS = 256  # along the rim of the sheet, whose distances to the electrode
 MAX_RIM_PITCHES = 10.0  # distances between neighbouring electrodes, by which a sheet may reach beyond them
 MAX_PAD_BEYOND = 0.5  # share of a pad that may lie more than one such distance outside of all electrodes
 MAX_OVERLAP = 0.02  # of the smaller of two pads
-VOLTAGES = 1e-9, 1e3  # V: least and greatest largest reading that electronics can measure
+VOLTAGES = 1e-9, 100.0  # V: least and greatest largest reading that electronics can measure
+MAX_CURRENT = 0.1  # A: EIT drives some milliamperes
 PAD_POINTS = 32  # along each side of a pad's box, at which that share is counted
 
 
@@ -35,9 +36,12 @@ def check_skin(session: Session, given: je.Skin | None, findings: list[Finding])
 
 
 def skin_findings(skin: je.Skin) -> Iterator[Finding]:
-    """What a skin describes that can hardly be: sizes, pads over one another, readings that are taken twice."""
+    """What a skin describes that can hardly be: sizes, currents, pads over one another, readings taken twice."""
     yield from _size_findings(skin)
     yield from _overlap_findings(skin)
+    if skin.protocol.current > MAX_CURRENT:
+        what = f"the drive current is {skin.protocol.current:g} A; scans of skins drive some milliamperes"
+        yield Finding(Severity.WARNING, "/device", what, "give the current of the protocol in A, such as 1e-3")
     rows, count = np.unique(np.asarray(skin.protocol.pattern), axis=0, return_counts=True)
     if (count > 1).any():
         twice = ", ".join(map(str, rows[count > 1][0].tolist()))
@@ -56,7 +60,7 @@ def voltage_findings(readings: np.ndarray) -> Iterator[Finding]:
     elif not low <= largest <= high:
         what = (
             f"the largest reading of the untouched skin is {largest:.3g} V; electronics measure no signal "
-            f"{'above 1 kV' if largest > high else 'below 1 nV'}"
+            f"{'above 100 V' if largest > high else 'below 1 nV'}"
         )
         yield Finding(Severity.WARNING, "/device", what, remedy)
 
