@@ -3,6 +3,7 @@
 from typing import Any
 
 from jaxeit.kinds import require_kind
+from jaxeit.model.fidelity import require_dtype
 
 from ..session import SessionError
 from ..session.given import call_on
@@ -11,18 +12,20 @@ from .logs.calibration import LogCalibration
 
 
 def require_calibration(calibration: Any, call: str, for_logs: str = "give that of a skin") -> None:
-    """Refuse what is no calibration of a skin, such as a path, in a ``call``.
+    """Refuse what is no calibration of a skin, such as a path, or one that JAX would lower to float32, in a ``call``.
 
     Args:
         for_logs: what to do with the calibration of a log, which functions that take one have handled before.
 
     Raises:
         SessionError: naming the call, and what to give.
+        FidelityError: for a calibration of float64 while JAX's x64 mode is off.
     """
     if isinstance(calibration, LogCalibration):
         raise SessionError(f"{call}: the calibration is of a log, which has no EIT; {for_logs}")
     give = call_on("calib.load_calibration", calibration)
     require_kind(calibration, Calibration, SessionError, "a Calibration", give, call)
+    require_dtype(calibration.dtype, f"{call}: the calibration is of float64")
 
 
 def require_no_eit_choices(call: str, **choices: object) -> None:

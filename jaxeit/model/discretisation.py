@@ -173,10 +173,12 @@ def discretise(
 
 
 def require_model(model: Any) -> None:
-    """Refuse an object in the place of a model, such as a skin or a scene; raises `SceneError`."""
+    """Refuse an object in the place of a model, such as a skin or a scene, and a model that JAX would compute in less
+    than its precision; raises `SceneError`, `FidelityError`."""
     if not isinstance(model, Model):
         kind = type(model).__name__
         raise SceneError(f"{kind} is not a model; make one, such as jaxeit.discretise(scene, jaxeit.Fidelity.draft())")
+    require_dtype(model.dtype, "the model is of float64")
 
 
 def require_scene(scene: Any) -> None:

@@ -89,14 +89,14 @@ def _float(dtype: Any) -> np.dtype:
     return wanted
 
 
-def require_dtype(dtype: np.dtype) -> None:
-    """Raise an error for a precision that JAX would silently lower.
+def require_dtype(dtype: np.dtype, what: str = "float64 is asked for") -> None:
+    """Raise an error for a precision that JAX would silently lower; ``what`` begins the message.
 
     Raises:
         FidelityError: for float64 while JAX's x64 mode is off.
     """
     if dtype == np.float64 and jnp.result_type(float) != np.float64:
         raise FidelityError(
-            "float64 is asked for, but JAX is in 32-bit mode; before making any array call "
+            f"{what}, but JAX is in 32-bit mode; before making any array call "
             'jax.config.update("jax_enable_x64", True), or ask for Fidelity(dtype="float32")'
         )

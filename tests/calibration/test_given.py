@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -47,6 +48,17 @@ def test_a_path_in_the_place_of_a_calibration_is_told_how_to_load_it(grid):
         said = r"'c.h5' is not a Calibration; give calib.load_calibration\('c.h5'\)"
         for name, call in calls.items():
             with pytest.raises(SessionError, match=f"^{name}: {said}$"):
+                call()
+
+
+def test_a_calibration_is_used_in_its_precision(grid, calibration):
+    """JAX would lower it to float32 without a word, or fail in the middle of a fit."""
+    with calib.open_session(grid) as session, jax.enable_x64(False):
+        for name, call in {
+            "evaluate": lambda: calib.evaluate(calibration, session),
+            "force_map": lambda: calib.force_map(calibration, [0.0], [0.0]),
+        }.items():
+            with pytest.raises(je.model.FidelityError, match=f"^{name}: the calibration is of float64, but JAX is"):
                 call()
 
 

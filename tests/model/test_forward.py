@@ -282,6 +282,13 @@ def test_float64_without_x64_is_refused(skin):
         je.discretise(je.Scene(skin), je.Fidelity.draft())
 
 
+@pytest.mark.parametrize("call", [je.forward, je.jacobian, je.prepare])
+def test_a_model_of_float64_is_refused_without_x64(model, call):
+    said = "^the model is of float64, but JAX is in 32-bit mode; before making any array call jax.config.update"
+    with jax.enable_x64(False), pytest.raises(je.model.FidelityError, match=said):
+        call(model)
+
+
 def test_electrodes_on_one_node_are_refused():
     points = [(0.06, 0.06), (0.06, 0.06), (0.1, 0.1), (0.14, 0.1)]
     with pytest.raises(je.skin.ElectrodeError, match="electrodes 0 and 1"):
