@@ -37,6 +37,7 @@ from .given import require_calibration, require_no_eit_choices
 from .hysteresis_loops import typical_loops
 from .layer import learn_layer
 from .localisation.electrode_places import PlacedElectrodes, place_electrodes
+from .localisation.locators import ContactLocator
 from .localisation.press_images import Imager, PressImages, prepare_imager
 from .logs.calibration import LogCalibration
 from .logs.evaluation import LogEvaluation
@@ -197,7 +198,7 @@ def _contradictions(found: _Found) -> tuple[str, ...]:
     return (
         *contradicted_presses(presses, held_out.sum(1), seen),
         *drifting_pads(presses, names, held_out, by_place=corrected),
-        *(() if seen is None else moved_places(presses, seen)),
+        *(moved_places(presses, seen) if seen is not None and isinstance(found.imager.locator, ContactLocator) else ()),
     )
 
 

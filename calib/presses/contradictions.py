@@ -62,7 +62,7 @@ def drifting_pads(
     data, session = presses.data, presses.groups["session"]
     time = np.concatenate([m.presses.t_hold0[m.presses.accepted] for m in presses.recordings])
     told = np.nan_to_num(pad_force.sum(1))
-    known = (told > 0) & (data.force > 0)
+    known = (told > 0) & (data.force > 0) & (by_place | np.isfinite(presses.position).all(1))
     ratio = np.log(np.where(known, data.force, 1) / np.where(known, told, 1))
     lines = []
     for number, recording in enumerate(presses.recordings):
@@ -98,7 +98,7 @@ def moved_places(presses: PooledPresses, place: Float[np.ndarray, "n 2"]) -> tup
     """A line for each session whose stated places as a whole lie elsewhere than the contacts of the images.
 
     Args:
-        place: that the image tells, (presses, 2) m; NaN: not known.
+        place: that fitted contacts tell, (presses, 2) m; NaN: not known. Centroids of images lie inwards as a whole.
     """
     session, lines = presses.groups["session"], []
     for number, recording in enumerate(presses.recordings):

@@ -164,6 +164,14 @@ def test_a_drift_that_places_may_explain_is_not_named(sixty_four):
     assert drifting_pads(swept, ["a", "b", "c", "d"], part, by_place=False) == ()
 
 
+def test_presses_without_places_tell_of_drifts_by_a_correction_only(sixty_four):
+    nowhere = replace(sixty_four, position=np.full((64, 2), np.nan))
+    part = told_forces(nowhere, np.exp(-0.7 * np.linspace(0, 1, 64)))
+    assert drifting_pads(nowhere, ["a", "b", "c", "d"], part, by_place=True)
+    assert drifting_pads(nowhere, ["a", "b", "c", "d"], part, by_place=False) == ()
+    assert moved_places(nowhere, sixty_four.position) == ()
+
+
 @pytest.mark.parametrize(
     ("listed", "said"),
     [
