@@ -71,7 +71,8 @@ def _runs(session: Session, name: str) -> np.ndarray:
     runs = np.zeros(count, np.uint64)
     for row in range(RUN_ROWS):
         runs = runs * MULTIPLIER + rows[row : row + count]
-    return runs[changes[RUN_ROWS - 1 :] - changes[:count] >= RUN_ROWS // 2]
+    varied: np.ndarray = runs[changes[RUN_ROWS - 1 :] - changes[:count] >= RUN_ROWS // 2]
+    return varied
 
 
 def _marks(values: np.ndarray) -> np.ndarray:
