@@ -378,7 +378,11 @@ def test_the_linear_recipe(tank, level, least):
 def test_total_variation(tank, level, least):
     """With finer pixels and a heavier penalty, which suit these frames at level 1 and were chosen on them."""
     data, model, water = tank
-    heavy = {"penalty": je.imaging.IsotropicVariation(), "relative_error": 0.05, "borders": None}
+    heavy = {
+        "penalty": je.imaging.IsotropicVariation(),
+        "errors": je.imaging.ChangeErrors(relative=0.05),
+        "borders": None,
+    }
     way = partial(ktc.variation, model, je.Pixels(40).on(model), water, **heavy)
     (row,) = ktc.scored(data, {"variation": way}, level)
     assert row["mean"] > least
