@@ -70,7 +70,8 @@ def prepare_calibrated_tracker(
         raise NotFollowed("no reading has noise without contact, so none tells how sure it is")
     model = je.discretise(je.Scene(calibration.skin), LOAD_FIDELITY)
     errors = _covariance(np.where(channels, noise, 1.0), np.where(channels, untouched, 0.0))
-    prepare = partial(je.tracking.prepare_tracker, model, calibration.skin, settings, noise=errors, channels=channels)
+    known = {"settings": settings, "noise": errors, "channels": channels}
+    prepare = partial(je.tracking.prepare_tracker, model, calibration.skin, **known)
     try:
         tracker = prepare(untouched=untouched)
     except je.imaging.InverseError as error:
