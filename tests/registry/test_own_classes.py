@@ -12,7 +12,7 @@ import pytest
 import calib
 import jaxeit as je
 from calib import calibration
-from calib.fitting import CURVES, FIELDS, LOSSES
+from calib.fitting import CURVES, FIELDS
 from jaxeit.linalg import Dense
 
 OWN = '''
@@ -147,11 +147,6 @@ def test_the_effect_of_the_documentation(tmp_path, monkeypatch):
     assert tomllib.loads(entry)["project"]["entry-points"] == {
         je.effects.EFFECTS.group: {"Wetness": "my_effects:Wetness"}
     }
-    groups = dict(re.findall(r"\| ([\w ]+) \| [^|]* \| [^|]* \| `([\w.]+)` \|", text))
-    assert groups.pop("import format") == "calib.importers"
-    known = [je.effects.EFFECTS, je.skin.ELECTRODES, je.imaging.PRIORS, je.imaging.METHODS, je.imaging.HYPERPARAMETERS]
-    known += [je.model.BASES, CURVES, FIELDS, LOSSES]
-    assert sorted(groups.values()) == sorted(registry.group for registry in known)
 
 
 def test_a_curve_in_a_recipe_and_in_a_fit(own):
@@ -224,10 +219,10 @@ def test_a_field(own):
 def test_the_page_lists_every_kind_with_its_entry_point_group():
     page = (Path(__file__).parents[2] / "docs" / "own-classes.md").read_text()
     rooms = [je.effects, je.skin, je.imaging, je.model, je.linalg, je.scan, calib.fitting, calib.presses, calibration]
-    kinds = [thing for room in rooms for thing in vars(room).values() if isinstance(thing, je.registry.Registry)]
+    groups = {thing.group for room in rooms for thing in vars(room).values() if isinstance(thing, je.registry.Registry)}
     listed = re.findall(r"\| `(\w+\.\w+)` \|$", page, re.MULTILINE)
-    assert {kind.group for kind in kinds} <= {*listed}
-    assert len({kind.group for kind in kinds}) > 14
+    assert sorted(listed) == sorted({*groups, "calib.importers"})
+    assert groups >= {"jaxeit.effects", "jaxeit.electrodes", "jaxeit.priors", "calib.curves", "calib.losses"}
 
 
 class Halved(calib.presses.AbstractCorrection):

@@ -48,7 +48,7 @@ def _cell_findings(stats: StreamStatistics) -> Iterator[Finding]:
 def _away(values: np.ndarray) -> np.ndarray:
     """Rows of the value that stands most often far from those before and after; empty if none stands often."""
     none = np.zeros(0, int)
-    if len(values) < 3:
+    if len(values) < 3 or not np.isfinite(values).any():
         return none
     before, here, after = values[:-2], values[1:-1], values[2:]
     apart = np.abs(after - before)
