@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import errno
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar, overload
 
@@ -31,6 +32,32 @@ def settings_of_option(args: argparse.Namespace, name: str, kind: type[T]) -> T 
 
     text = getattr(args, name)
     return None if text is None else from_words(kind, text, "--" + name.replace("_", "-"))
+
+
+def of_option(name: str, text: str, make: Callable[[str, bool], T]) -> T:
+    """What a registry makes of the text of an option, which may name a class by its import path.
+
+    Raises:
+        ValueError: naming the option.
+    """
+    try:
+        return make(text, True)
+    except ValueError as error:
+        raise ValueError(f"--{name}: {error}") from None
+
+
+def add_tracking_arguments(parser: argparse.ArgumentParser, text: str) -> None:
+    """The options that follow contacts from frame to frame."""
+    parser.add_argument("--track", action="store_true", help=text)
+    add_settings_argument(parser, "--tracker", "as --track, with settings of jaxeit.tracking.TrackerSettings", "most=5")
+
+
+def tracking_of(args: argparse.Namespace) -> "bool | je.tracking.TrackerSettings":
+    """Whether contacts are followed; with the settings of the options, or the usual ones."""
+    from jaxeit.tracking import TrackerSettings
+
+    settings = settings_of_option(args, "tracker", TrackerSettings)
+    return bool(args.track) if settings is None else settings
 
 
 def count(text: str) -> int:

@@ -27,7 +27,7 @@ from ..calibration.recipe_text import (
 from ..fitting import CURVES, FIELDS, LOSSES
 from ..presses.corrections import BASELINES, CORRECTIONS, AbstractCorrection, LowPass
 from ..presses.table import Processing
-from .arguments import above_zero, count
+from .arguments import above_zero, count, of_option
 
 T = TypeVar("T")
 
@@ -175,7 +175,7 @@ def _corrections(
     if alone is not None:
         base = None if alone == DEFAULT else ()
     elif named:
-        base = tuple(_of_option("correction", one, CORRECTIONS.make) for one in named)
+        base = tuple(of_option("correction", one, CORRECTIONS.make) for one in named)
     if args.low_pass is None:
         return base
     kept = base or ()
@@ -193,11 +193,4 @@ def refuse_corrections(args: argparse.Namespace) -> None:
 
 
 def _made(args: argparse.Namespace, name: str, make: Callable[[str, bool], T]) -> T:
-    return _of_option(name, getattr(args, name), make)
-
-
-def _of_option(name: str, text: str, make: Callable[[str, bool], T]) -> T:
-    try:
-        return make(text, True)
-    except ValueError as error:
-        raise ValueError(f"--{name}: {error}") from None
+    return of_option(name, getattr(args, name), make)

@@ -20,7 +20,7 @@ from jaxeit.kinds import require_kind
 
 from ...check.acceptance import accept
 from ...fitting.curves.fitted import predict_pads
-from ...fitting.curves.samples import bucket
+from ...fitting.curves.samples import by_rows
 from ...fitting.fields import Places
 from ...fitting.gain_update import GainDrift, GainPrior, GainUpdate, update_gains
 from ...fitting.pad_gains import gain_slopes
@@ -463,12 +463,10 @@ def gain_prior(calibration: Calibration, drift: GainDrift, *, together: bool) ->
 
 def _expected(calibration: Calibration, loads: LoadedPads, gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pad forces (n, pads) N at log gains, and the slopes (n, pads) of the total in minus the log gains."""
-    model, count = force_model(calibration).moved(None), len(loads.pressure)
-    # The last row repeats, up to one of a few lengths, because each length compiles the program again.
-    rows = np.minimum(np.arange(bucket(count)), count - 1)
-    then = jnp.asarray((loads.pressure * np.exp(-gain))[rows], model.pads.dtype)
-    places = None if loads.places is None else loads.places[jnp.asarray(rows)]
-    return tuple(np.asarray(part, float)[:count] for part in _forces_and_slopes(model, then, places))  # type: ignore[return-value]
+    model = force_model(calibration).moved(None)
+    then = np.asarray(loads.pressure * np.exp(-gain), model.pads.dtype)
+    force, slope = by_rows(_forces_and_slopes, then, loads.places, before=(model,))
+    return force.astype(float), slope.astype(float)
 
 
 @je.verb

@@ -47,9 +47,10 @@ def pad_response_findings(evidence: PressEvidence, skin: je.Skin, start: int) ->
         scaled = _scaled_pads(size * np.array([pad.area for pad in skin.pads]) / force[:, None], alone)
         for pad, factor in scaled.items():
             yield _scale_finding(skin, pad, factor)
-        known = np.isin(alone, [*scaled])
-        yield from _unfelt_findings(evidence, size.sum(1) / force, known)
-        yield from _silent_findings(evidence, skin, size / force[:, None], np.where(known, -1, alone))
+        known, response = np.isin(alone, [*scaled]), size / force[:, None]
+        unfelt = response.sum(1) < MIN_PAD_RESPONSE * np.median(response.sum(1))
+        yield from _unfelt_findings(evidence, unfelt & ~known)
+        yield from _silent_findings(evidence, skin, response, np.where(known, -1, alone), unfelt)
     falling = [*_falling_findings(evidence, skin, strongest, largest, start)]
     yield from falling
     late = [] if falling else [*_late_findings(evidence, alone, size)]
@@ -119,12 +120,11 @@ def _scale_finding(skin: je.Skin, pad: int, factor: float) -> Finding:
     return Finding(Severity.WARNING, PRESSURE, what, remedy)
 
 
-def _unfelt_findings(evidence: PressEvidence, response: np.ndarray, known: np.ndarray) -> Iterator[Finding]:
-    """Presses with force that no pad feels, other than the known ones (presses,); `response` is Pa/N."""
-    unfelt = (response < MIN_PAD_RESPONSE * np.median(response)) & ~known
+def _unfelt_findings(evidence: PressEvidence, unfelt: np.ndarray) -> Iterator[Finding]:
+    """Presses with force that no pad feels, flags (presses,)."""
     if unfelt.any():
         rows = evidence.number[unfelt]
-        what = f"no pad feels {len(rows)} of {len(response)} presses that have force: {listed(rows)}"
+        what = f"no pad feels {len(rows)} of {len(unfelt)} presses that have force: {listed(rows)}"
         remedy = "check the tubes of the pads, and that the pressure stream did not stand still"
         yield Finding(Severity.WARNING, PRESSURE, what, remedy)
 
@@ -159,17 +159,17 @@ def _agreement(alone: np.ndarray, size: np.ndarray, rows: int) -> float:
 
 
 def _silent_findings(
-    evidence: PressEvidence, skin: je.Skin, response: np.ndarray, alone: np.ndarray
+    evidence: PressEvidence, skin: je.Skin, response: np.ndarray, alone: np.ndarray, unfelt: np.ndarray
 ) -> Iterator[Finding]:
     """Presses that the pad under the tip does not feel, while it feels others and pads beside it bear little.
 
     Args:
         response: (presses, pads) Pa/N.
         alone: pad under the tip, (presses,); -1: none, or one that is known to be wrong.
+        unfelt: presses that no pad feels, (presses,), of which something else is said.
     """
     whole = response.sum(1)
     weak = whole < MAX_BESIDE * np.median(whole)
-    unfelt = whole < MIN_PAD_RESPONSE * np.median(whole)
     for pad in range(response.shape[1]):
         on, own = alone == pad, response[:, pad]
         silent = on & weak & ~unfelt & (own < MIN_PAD_RESPONSE * _median(own[on & ~weak]))

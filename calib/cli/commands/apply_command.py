@@ -8,10 +8,12 @@ from ..arguments import (
     above_zero,
     add_proposal_argument,
     add_settings_argument,
+    add_tracking_arguments,
     prepare_results,
     proposal_of,
     require_matplotlib_for,
     settings_of_option,
+    tracking_of,
 )
 from ..recipe_options import add_correction_arguments, processing_of, refuse_corrections
 from ..terminal import progress_bar, show
@@ -37,8 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "with --loads: what is known of loads, settings of jaxeit.contacts.LoadSettings"
     add_settings_argument(parser, "--load-settings", text, "width=0.008")
     text = "also follow contacts from frame to frame: number, place with covariance, force, smoothed over time"
-    parser.add_argument("--track", action="store_true", help=text)
-    add_settings_argument(parser, "--tracker", "as --track, with settings of jaxeit.tracking.TrackerSettings", "most=5")
+    add_tracking_arguments(parser, text)
     text = (
         "write an HTML report: paths and forces of the contacts that are followed (--track), probabilities of --loads"
     )
@@ -52,13 +53,12 @@ def run(args: argparse.Namespace) -> int:
 
     set_up()
     from jaxeit.contacts import LoadSettings
-    from jaxeit.tracking import TrackerSettings
 
     from ...calibration import LogCalibration, apply, load_calibration
     from ...session import open_session
 
     _check_options(args)
-    tracker = settings_of_option(args, "tracker", TrackerSettings)
+    track = tracking_of(args)
     known = settings_of_option(args, "load_settings", LoadSettings)
     prepare_results(args, "output", "report")
     calibration = load_calibration(args.calibration)
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
             loads=args.loads,
             proposal=proposal_of(args.proposal),
             load_settings=LoadSettings.round_tips() if args.round_tips else known,
-            track=args.track if tracker is None else tracker,
+            track=track,
             tell=show,
         )
         frames = len(session.stream("eit"))
@@ -99,13 +99,9 @@ def _check_options(args: argparse.Namespace) -> None:
     if args.round_tips and args.proposal not in (None, NO_PROPOSAL):
         raise ValueError("--round-tips: a proposal was trained on tips of all shapes; leave out one of the two")
     if args.report is not None:
-        if not _follows(args) and args.loads is None:
+        if not tracking_of(args) and args.loads is None:
             raise ValueError("--report: it is about contacts; add --track, which follows them, or --loads SECONDS")
         require_matplotlib_for("--report")
-
-
-def _follows(args: argparse.Namespace) -> bool:
-    return args.track or args.tracker is not None
 
 
 def _run_log(args: argparse.Namespace, calibration: "LogCalibration") -> int:
@@ -113,7 +109,7 @@ def _run_log(args: argparse.Namespace, calibration: "LogCalibration") -> int:
     from ...session import open_session
 
     refuse_corrections(args)
-    if args.loads is not None or _follows(args):
+    if args.loads is not None or tracking_of(args):
         option = "--loads" if args.loads is not None else "--tracker" if args.tracker is not None else "--track"
         raise ValueError(f"{option}: the calibration of a log has no EIT, which tells where contacts are")
     with open_session(args.session) as session:

@@ -10,6 +10,7 @@ from ..arguments import (
     above_zero,
     at_least_zero,
     count,
+    of_option,
     part,
     picture_kind,
     prepare_results,
@@ -92,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
         picture_kind(args.picture)
         require_matplotlib_for("--picture")
     began, skin = perf_counter(), _asked_skin(args)
-    criterion = _criterion(args.criterion)
+    criterion = of_option("criterion", args.criterion, je.scan.CRITERIA.make)
     limits, readings = _limits(args), _readings(args, skin)
     announce_model(skin, je.Fidelity.draft())
     made = _designed(args, skin, criterion, limits, readings)
@@ -103,15 +104,6 @@ def run(args: argparse.Namespace) -> int:
     show("\n".join(_report(made, args.switch)))
     show(f"{args.output}: written after {perf_counter() - began:.0f} s")
     return 0
-
-
-def _criterion(text: str) -> "AbstractCriterion":
-    import jaxeit as je
-
-    try:
-        return je.scan.CRITERIA.make(text, allow_import=True)
-    except ValueError as error:
-        raise ValueError(f"--criterion: {error}") from None
 
 
 def _asked_skin(args: argparse.Namespace) -> "je.Skin":

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 from ..arguments import (
     above_zero,
     add_proposal_argument,
-    add_settings_argument,
+    add_tracking_arguments,
     port,
     prepare_outputs,
     proposal_of,
-    settings_of_option,
+    tracking_of,
 )
 from ..signals import orderly_end
 from ..terminal import say
@@ -19,8 +19,6 @@ from ..terminal import say
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from contextlib import AbstractContextManager
-
-    from jaxeit.tracking import TrackerSettings
 
     from ...calibration import Calibration, LogCalibration
     from ...live.loop import LiveControl, LiveSettings
@@ -36,8 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "request the next readings from the device: few at rest, those around the contact during a contact"
     parser.add_argument("--event-driven", action="store_true", help=text)
     text = "follow contacts from frame to frame: each keeps its number, with ellipse and force"
-    parser.add_argument("--track", action="store_true", help=text)
-    add_settings_argument(parser, "--tracker", "as --track, with settings of jaxeit.tracking.TrackerSettings", "most=5")
+    add_tracking_arguments(parser, text)
     add_proposal_argument(parser, "the network of jaxeit train that tells what touches the skin, in each frame")
     text = "let zero and relative gains of the pads follow their drift, and write the moved calibration"
     parser.add_argument("--recalibrate", metavar="NEW.h5", help=text)
@@ -140,14 +137,6 @@ def _timed(seconds: float, orders: "StopRequest") -> "Iterator[None]":
         timer.cancel()
 
 
-def _track(args: argparse.Namespace) -> "bool | TrackerSettings":
-    """Whether contacts are followed; with settings of the options, or the usual ones."""
-    from jaxeit.tracking import TrackerSettings
-
-    settings = settings_of_option(args, "tracker", TrackerSettings)
-    return bool(args.track) if settings is None else settings
-
-
 def _settings(args: argparse.Namespace) -> "LiveSettings":
     from ...live.loop import LiveSettings
 
@@ -156,7 +145,7 @@ def _settings(args: argparse.Namespace) -> "LiveSettings":
         realtime=args.realtime,
         rest=args.rest,
         wait=args.wait,
-        track=_track(args),
+        track=tracking_of(args),
         proposal=proposal_of(args.proposal),
         recalibrate=args.recalibrate is not None,
         moved=args.recalibrate,
@@ -176,7 +165,7 @@ def _viewers(
     from ...live.bridges import Bridge, FoxgloveServer, RosNode
 
     names = {name: value for name in ("prefix", "frame_id") if (value := getattr(args, name)) is not None}
-    options: dict[str, Any] = {"track": bool(_track(args)), "warn": say, **names}
+    options: dict[str, Any] = {"track": bool(tracking_of(args)), "warn": say, **names}
     if args.ros2 is not None:
         yield Bridge(calibration, RosNode(args.ros2), **options)
     if args.foxglove is not None:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 import jaxeit as je
 
-from ..curves.samples import bucket
+from ..curves.samples import by_rows
 from ..fields import AbstractField, FittedField, Geometry, fit_field, log_gain, single_places
 
 # Part of the largest force above which a sample belongs to a press.
@@ -57,10 +57,8 @@ class LogLocation:
         """Gain (n,) and variance of its logarithm; where the place is not known, 1 and the scatter over places."""
         if self.gain is None:
             return np.ones(len(place)), np.zeros(len(place))
-        n = len(place)
-        wide = np.pad(place, ((0, bucket(n) - n), (0, 0)), constant_values=np.nan)
-        mean, variance = _log_gains(self.gain, jnp.asarray(wide, self.gain.coefficients.dtype))
-        return np.exp(np.asarray(mean)[:n]), np.asarray(variance)[:n]
+        mean, variance = by_rows(_log_gains, np.asarray(place, self.gain.coefficients.dtype), before=(self.gain,))
+        return np.exp(mean), variance
 
 
 def relative(box: Float[np.ndarray, "2 2"], place: Float[np.ndarray, "n 2"]) -> np.ndarray:
