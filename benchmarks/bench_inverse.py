@@ -60,11 +60,12 @@ class Given:
         self.on_host, self.recon = recon.on_host(dtype), recon.astype(dtype)
         self.matrix, self.factor = np.asarray(self.recon.matrix), np.asarray(self.recon.factor)
         readings = jnp.eye(recon.readings, dtype=self.recon.factor.dtype)
-        self.pair_sums = sp.csr_array(np.asarray(self.recon.whitening.sums(readings)).T)  # (sums, readings): P^T W
+        # From readings to weighted sums, (sums, readings): P^T W
+        self.weighted_sums = sp.csr_array(np.asarray(self.recon.whitening.sums(readings)).T)
         w, ends = self.recon.whitening, values * self.factor.itemsize
         self.ours = sum(a.nbytes for a in (self.factor, w.lines, w.sign, w.weight, w.channels)) + ends
         self.dense = self.matrix.nbytes + ends
-        self.compressed = self.factor.nbytes + self.pair_sums.data.nbytes + self.pair_sums.indices.nbytes + ends
+        self.compressed = self.factor.nbytes + self.weighted_sums.data.nbytes + self.weighted_sums.indices.nbytes + ends
 
 
 def in_a_loop(recon: je.Reconstructor) -> Callable[[jax.Array], jax.Array]:
@@ -117,7 +118,7 @@ def single_ways(recon: je.Reconstructor, frame: np.ndarray) -> Ways:
             "jaxeit, in a compiled loop,": Way(lambda: looped(many), np.tile(exact, (LOOP, 1)), given.ours, LOOP, LOOP),
             "jaxeit, one reading is NaN,": Way(lambda: np.asarray(mine(broken)), mended, given.ours),
             "NumPy, Q dv,": Way(lambda: given.matrix @ whole, exact, given.dense),
-            BY_HAND: Way(lambda: given.factor @ (given.pair_sums @ whole), exact, given.compressed),
+            BY_HAND: Way(lambda: given.factor @ (given.weighted_sums @ whole), exact, given.compressed),
         }
 
     return both_precisions(ways)
@@ -132,7 +133,7 @@ def batch_ways(recon: je.Reconstructor, frames: np.ndarray) -> Ways:
     def ways(dtype: str) -> Ways:
         given, n = Given(recon, dtype, frames.size + exact.size), len(frames)
         whole, lacking, mine = frames.astype(dtype), broken.astype(dtype), given.recon
-        factor, sums = given.factor, given.pair_sums
+        factor, sums = given.factor, given.weighted_sums
         return {
             QUICKEST: Way(lambda: given.on_host(whole), exact, given.ours, n),
             "jaxeit, NumPy in and out,": Way(lambda: np.asarray(mine(whole)), exact, given.ours, n),

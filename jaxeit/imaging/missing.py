@@ -1,7 +1,8 @@
 """Readings that are missing from a frame: one algebra for JAX, NumPy, reconstructors and the contact finder.
 
-`noise` has the symbols: readings v = P z plus noise of inverse covariance W, their sums t = P^T W v, and G = P^T W P. T
-is the matrix that predicts pair sums, ``z = T t``, from the one-step image. The missing readings m hold zero in v.
+`noise` has the symbols: readings v = P z plus noise of inverse covariance W, their weighted sums t = P^T W v, and
+G = P^T W P. T is the matrix that predicts pair sums, ``z = T t``, from the one-step image. The missing readings m hold
+zero in v.
 `Missing` describes them as b = B z plus independent noise of weight w, with what the other readings say about them
 through the noise, e:
 
@@ -223,7 +224,7 @@ def _gathered(
         return Missing(PairRows(whitening.pairs[place], signs), weight, jnp.zeros_like(weight))
     weights = jnp.where(there[:, None], whitening.weight[place], 0)
     block = jnp.where(there[:, None] & there, weights[:, place], jnp.diag((~there).astype(known.dtype)))
-    return correlated(JAX, whitening.pair_sums(weights), block, weights @ known)
+    return correlated(JAX, whitening.adjoint(weights), block, weights @ known)
 
 
 def _masked(

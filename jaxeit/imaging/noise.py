@@ -75,10 +75,11 @@ class Whitening(eqx.Module):
     def sums(self, dv: Float[Array, "... readings"]) -> Float[Array, "... k"]:
         """The weighted sums ``t = P^T W dv``, A/V; channels that are not used may hold anything."""
         dv = jnp.where(self.channels, dv, 0)
-        return self.pair_sums(dv * self.weight if self.weight.ndim == 1 else dv @ self.weight)
+        return self.adjoint(dv * self.weight if self.weight.ndim == 1 else dv @ self.weight)
 
-    def pair_sums(self, values: Float[Array, "... readings"]) -> Float[Array, "... k"]:
-        """``P^T v``: for each pair sum, the sum of the values of its readings, times the current."""
+    def adjoint(self, values: Float[Array, "... readings"]) -> Float[Array, "... k"]:
+        """``P^T v``, the adjoint of `readings`: for each pair sum, the values of its readings with their signs, times
+        the current."""
         if values.ndim == 1:
             return self.current * jnp.sum(self.sign * values[self.lines], -1)
         batch = values.shape[:-1]
@@ -180,11 +181,11 @@ def with_common_mode(pattern: np.ndarray, gain: float) -> tuple[np.ndarray, sp.c
     ``V + gain (V+ + V-) / 2``, with potentials above drive-."""
     source, sink, plus, minus = pattern.T
     ends = np.stack([(plus, source), (minus, source), (plus, sink), (minus, sink), (sink, source), (sink, sink)])
-    pairs, number = np.unique(np.sort(ends, 1).swapaxes(1, 2).reshape(-1, 2), axis=0, return_inverse=True)
+    electrodes, number = np.unique(np.sort(ends, 1).swapaxes(1, 2).reshape(-1, 2), axis=0, return_inverse=True)
     shares = np.append(SIGNS, [0, 0]) + gain / 2 * np.array([1, 1, -1, -1, -2, 2])
     rows = np.tile(np.arange(len(pattern)), len(ends))
-    p = sp.csr_array((np.repeat(shares, len(pattern)), (rows, number.ravel())), (len(pattern), len(pairs)))
-    return pairs.astype(np.int64), p
+    p = sp.csr_array((np.repeat(shares, len(pattern)), (rows, number.ravel())), (len(pattern), len(electrodes)))
+    return electrodes.astype(np.int64), p
 
 
 def lines_of(pairs: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -220,11 +221,11 @@ def gram_of(p: Any, weight: Any) -> Any:
 
 
 class PairStructure(NamedTuple):
-    """Which pair sums are independent in the readings that are used: ``P = P_t M``.
+    """Which pair sums are independent in the readings that are used: ``P = P_i M``.
 
     | meaning                                                        | shape  |
     |----------------------------------------------------------------|--------|
-    | taken t: independent pair sums                                 | (r,)   |
+    | taken i: independent pair sums                                 | (r,)   |
     | mixing M                                                       | (r, k) |
     | inverse K of M: ``K M^T = I``, and K is zero where M is        | (r, k) |
     """
@@ -253,7 +254,7 @@ def structure_of(gram: np.ndarray) -> PairStructure:
 def _factors(p: sp.csr_array, current: Any, weight: Any, channels: np.ndarray) -> tuple[Any, Any]:
     """C of ``G = C^T C``, as many rows as its rank, and the least E with ``E C^T = I``.
 
-    With ``G_tt = L L^T`` on the independent pair sums t, ``C = L^T M`` and ``E = L^-1 K`` (`PairStructure`). Where JAX
+    With ``G_ii = L L^T`` on the independent pair sums i, ``C = L^T M`` and ``E = L^-1 K`` (`PairStructure`). Where JAX
     traces the weights, the structure is that of equal weights.
     """
     if is_traced(current, weight):

@@ -30,11 +30,11 @@ class NumpyImages:
         self._signs = np.broadcast_to(signs, self._pairs.shape)
         self._correlated = self._weight.ndim == 2
         ones = np.ones_like(self._weight, shape=len(self._pairs))
-        sums = self._pair_sums(ones if self._correlated else self._weight)
+        sums = self._adjoint(ones if self._correlated else self._weight)
         self._exact_sums = sums @ self._weight if self._correlated else sums
         self._sums = self._exact_sums.astype(dtype, copy=False)
 
-    def _pair_sums(self, weight: np.ndarray) -> csr_array:
+    def _adjoint(self, weight: np.ndarray) -> csr_array:
         """``P^T`` times these weights, (k, readings); zero for channels that are not used."""
         place = self._pairs[self._used].ravel(), np.repeat(np.flatnonzero(self._used), self._pairs.shape[1])
         shares = (weight[:, None] * self._signs)[self._used].ravel()
@@ -98,6 +98,6 @@ class NumpyImages:
     @cached_property
     def _without_readings(self) -> tuple[np.ndarray, np.ndarray]:
         """``-predict`` and ``factor`` of the reconstructor that has no reading; see `missing` for the sign."""
-        gram = (self._exact_sums @ self._pair_sums(np.ones_like(self._weight)).T).toarray()
+        gram = (self._exact_sums @ self._adjoint(np.ones_like(self._weight)).T).toarray()
         predict, factor = removed(NUMPY, gram, self._predict, self._exact_factor)
         return -predict, np.ascontiguousarray(factor)

@@ -27,7 +27,7 @@ FORMAT = "jaxeit reconstructor 1"
 
 # Name: dimensions, unit, meaning.
 _SHARED = {
-    "predict": ("k k", "ohm2", "pair sums of the one-step image, from weighted ones of the readings"),
+    "predict": ("k k", "ohm2", "pair sums of the one-step image, from weighted sums of the readings"),
     "pairs": ("readings n", "1", "the pair sums of each reading: four, or as many as shares has"),
     "current": ("", "A", "amplitude of the stimulation"),
     "weight": ("readings *", "1/V2", "inverse of the noise: variances, or a covariance matrix"),

@@ -96,7 +96,7 @@ static inline double skin_predicted(uint32_t i, uint32_t j)
     return (double)(i >= j ? skin_predict[i * (i + 1) / 2 + j] : skin_predict[j * (j + 1) / 2 + i]);
 }
 
-/* Complete the pair sums t of a frame by what the image of its other readings predicts for the missing ones:
+/* Complete the weighted sums t of a frame by what the image of its other readings predicts for the missing ones:
    (1/w - B T B^T) q = B T t, then t += B^T q. Returns 0 if the other readings do not determine it. */
 static inline int skin_complete(const uint16_t *missing, uint32_t count, skin_exact *sums)
 {
@@ -145,7 +145,7 @@ static inline int skin_complete(const uint16_t *missing, uint32_t count, skin_ex
 }
 #endif
 
-/* Product of two vectors of pair sums. Eight sums side by side wait for each other an eighth of the time. */
+/* Product of two vectors, one number for each pair sum. Eight sums side by side wait for each other an eighth of the time. */
 static inline float skin_dot(const float *a, const float *b)
 {
     float part[8] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
