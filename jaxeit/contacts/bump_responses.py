@@ -16,6 +16,7 @@ so that K contacts are K + K (K + 1) / 2 bumps.  The table holds cubic B-splines
 derivatives, in the few directions of the whitened readings (`imaging.noise`) that bumps reach.
 """
 
+import itertools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -132,32 +133,50 @@ def nodes_of(model: Model, widths: tuple[float, float], columns: int) -> Nodes:
 def tabulate(model: Model, jacobian: np.ndarray, nodes: Nodes) -> np.ndarray:
     """Responses at the nodes, (ny, nx, nw, r): the Jacobian times the means of the bumps over the elements.
 
-    Rows of nodes are computed together with the elements that their bumps reach.
+    Tiles of nodes are computed together with the elements that their bumps reach.  Further away a bump would be a
+    number below 1e-308, with which a processor is ten times slower.
     """
     y, x, log_widths = nodes.axes
     out = np.empty((len(y), len(x), len(log_widths), len(jacobian)))
-    middle, size = _heights(model)
-    order = np.argsort(middle)
+    middle, size = _middles(model)
+    order = np.argsort(middle[:, 1])
     middle, jacobian = middle[order], jacobian[:, order]
     for level, width in enumerate(np.exp(log_widths)):
         points, weights = points_of(model, width)
-        column, row = points[order].transpose(2, 0, 1)
-        across = np.exp(-0.5 * ((column[..., None] - x) / width) ** 2) * weights[:, None]
-        for first in range(0, len(y), ROWS):
-            some = y[first : first + ROWS]
-            far = REACH * width + size
-            near = slice(*np.searchsorted(middle, [some[0] - far, some[-1] + far]))
-            along = np.exp(-0.5 * ((row[near, None] - some[:, None]) / width) ** 2)
-            means = along @ across[near]  # (elements, rows, x)
-            found = jacobian[:, near] @ means.reshape(len(means), -1)
-            part = np.moveaxis(found.reshape(-1, len(some), len(x)), 0, -1)
-            out[first : first + ROWS, :, level] = (nodes.scale / width) ** 2 * part
+        points, far = points[order], REACH * width + size
+        for columns in _tiles(x, int((x[-1] - x[0]) / (2 * far))):
+            beside = _reached(middle[:, 0], x[columns], far)
+            across = _bumps(points[beside, :, 0], x[columns], width) * weights[:, None]
+            for rows in _tiles(y, len(y) // ROWS):
+                first, last = np.searchsorted(middle[beside, 1], [y[rows][0] - far, y[rows][-1] + far])
+                near = beside[first:last]
+                along = np.swapaxes(_bumps(points[near, :, 1], y[rows], width), 1, 2)
+                means = along @ across[first:last]  # (elements, rows, columns)
+                found = jacobian[:, near] @ means.reshape(len(means), -1)
+                part = np.moveaxis(found.reshape(-1, *means.shape[1:]), 0, -1)
+                out[rows, columns, level] = (nodes.scale / width) ** 2 * part
     return out
 
 
-def _heights(model: Model) -> tuple[np.ndarray, float]:
-    """Middles of the elements along y, and the largest extent of one, m."""
-    corners = np.asarray(model.chart, float)[np.asarray(model.triangles), 1]
+def _tiles(axis: np.ndarray, count: int) -> list[slice]:
+    """The nodes of an axis in so many parts, or one."""
+    ends = np.linspace(0, len(axis), max(1, count) + 1).round().astype(int)
+    return [slice(a, b) for a, b in itertools.pairwise(ends.tolist())]
+
+
+def _reached(middle: np.ndarray, some: np.ndarray, far: float) -> np.ndarray:
+    """Which middles lie no further than this from a part of an axis."""
+    return np.flatnonzero((middle > some[0] - far) & (middle < some[-1] + far))
+
+
+def _bumps(points: np.ndarray, centres: np.ndarray, width: float) -> np.ndarray:
+    """Bumps in one dimension, (elements, q, centres), at points (elements, q)."""
+    return np.asarray(np.exp(-0.5 * ((points[..., None] - centres) / width) ** 2))
+
+
+def _middles(model: Model) -> tuple[np.ndarray, float]:
+    """Middles of the elements, (elements, 2), and the largest extent of one, m."""
+    corners = np.asarray(model.chart, float)[np.asarray(model.triangles)]
     return corners.mean(1), float(np.ptp(corners, axis=1).max())
 
 
