@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 import calib
+import jaxeit as je
 from calib.calibration.localisation.locators import CentroidLocator
 from calib.runtime import set_up
 
@@ -26,7 +27,8 @@ def places(run: Run) -> Iterator[Row]:
         plain = calib.calibrate([session], recipe=calib.Recipe())
         yield {"rows": [row("none", "none", plain.evaluation)]}
         for name in run.sizes(ESTIMATORS, ESTIMATORS[:1]):
-            recipe = calib.Recipe(location=calib.PadEdge(), locator=calib.ImageCentroid(name))
+            locator = calib.ImageCentroid(je.metrics.ESTIMATORS.make(name))
+            recipe = calib.Recipe(location=calib.PadEdge(), locator=locator)
             found = calib.calibrate([session], recipe=recipe)
             yield {"rows": [row(f"image-centroid, {name}", "the same", found.evaluation)]}
         if run.smoke:
@@ -34,7 +36,8 @@ def places(run: Run) -> Iterator[Row]:
         fitted = calib.calibrate([session], recipe=calib.Recipe(location=calib.PadEdge()))
         yield {"rows": [row("fitted-contact", "not exported", fitted.evaluation)]}
         for name in ESTIMATORS:
-            moved = calib.evaluate(replace(fitted, locator=CentroidLocator(name)), session)
+            locator = CentroidLocator(je.metrics.ESTIMATORS.make(name))
+            moved = calib.evaluate(replace(fitted, locator=locator), session)
             yield {"rows": [row("fitted-contact", f"--place {name}", moved)]}
 
 

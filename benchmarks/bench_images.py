@@ -21,6 +21,7 @@ import jax
 import numpy as np
 
 import jaxeit as je
+from calib.calibration.localisation.press_images import REPORTED_ESTIMATORS
 
 from .clock import in_turns, seconds, spread
 from .harness import Question, Run, stored
@@ -107,7 +108,7 @@ class Seen(NamedTuple):
 def by_image(recon: Any, one: Simulated, level: float) -> Seen:
     images = recon(one.frames)
     singles = images[: len(one.sites)]
-    places = {k: np.asarray(e(singles, recon)) for k, e in je.metrics.ESTIMATORS.items()}
+    places = {k: np.asarray(e(singles, recon)) for k, e in REPORTED_ESTIMATORS.items()}
     sums = np.asarray(je.metrics.image_sum(singles, recon.areas))
     return Seen(places, sums, in_regions(recon, np.asarray(images), level))
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-import jaxeit as je
+from calib.calibration.localisation.press_images import REPORTED_ESTIMATORS
 
 from .markdown import all_columns, cell, crossed, markdown, plain, replaced
 from .repeat import compared
@@ -156,7 +156,7 @@ def _repeat(*runs: Row) -> str:
 
 def _images(results: Row) -> Iterator[Row]:
     """Methods side by side; the error is that of the image's own best estimator, or of the fit."""
-    names = [f"{name}_mm" for name in (*je.metrics.ESTIMATORS, "parametric")]
+    names = [f"{name}_mm" for name in (*REPORTED_ESTIMATORS, "parametric")]
     for row in results["rows"]:
         yield {"seeds": results["seeds"]} | row | {"error": min(row[name] for name in names if name in row)}
 

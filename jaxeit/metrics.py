@@ -16,7 +16,8 @@ Example:
     images = recon(touched - je.forward(model))  # S, one for each place
     image = images[0]
 
-    for name, estimator in je.metrics.ESTIMATORS.items():  # Peak, two LevelCentroid, PositiveCentroid
+    for name in ("peak", "half", "quarter", "positive", "level-centroid:level=0.4"):
+        estimator = je.metrics.ESTIMATORS.make(name)  # "half" is LevelCentroid(0.5)
         errors = je.localisation_error(estimator(images, recon), places)
         print(f"{name}: {1e3 * errors.mean():.1f} mm")
     figures = je.metrics.greit_figures(images, recon, places, [0.1, 0.1])
@@ -36,7 +37,7 @@ from jaxtyping import Array, Float, Int, Integer, Real, Shaped
 from ._compile import full_precision, is_traced, verb
 from .kinds import shown, stated
 from .linalg.array_libraries import real_array
-from .registry import AbstractChoice, limited
+from .registry import AbstractChoice, Registry, limited
 
 __all__ = [
     "ESTIMATORS",
@@ -92,7 +93,10 @@ class Pictured(Protocol):
 
 
 class AbstractEstimator(AbstractChoice):
-    """An estimator of the contact's position from an image."""
+    """An estimator of the contact's position from an image.
+
+    A class of your own is named by its import path, as in ``--locator image-centroid:estimator=my_module:MyEstimator``.
+    """
 
     @abstractmethod
     def __call__(self, image: Float[ArrayLike, "... pixels"], recon: Pictured) -> Float[Array, "... 2"]:
@@ -169,13 +173,13 @@ def _centroid(weight: Float[Array, "... pixels"], centres: Float[Array, "pixels 
     return jnp.where(total > 0, weight @ centres / jnp.where(total > 0, total, 1), jnp.nan)
 
 
-ESTIMATORS: dict[str, AbstractEstimator] = {
-    "peak": Peak(),
-    "half": LevelCentroid(0.5),
-    "quarter": LevelCentroid(0.25),
-    "positive": PositiveCentroid(),
-}
-"""Estimators by the names that reports use."""
+ESTIMATORS = Registry(
+    AbstractEstimator,
+    "estimator",
+    "jaxeit.estimators",
+    words={"half": "level-centroid:level=0.5", "quarter": "level-centroid:level=0.25", "positive": "positive-centroid"},
+)
+"""Estimators by the names that recipes and the command line use; "half" and "quarter" are levels of `LevelCentroid`."""
 
 
 def localisation_error(estimated: Places, true: Places) -> Float[Array, "..."]:

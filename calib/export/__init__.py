@@ -4,11 +4,12 @@ Example:
     import jax
 
     import calib
+    import jaxeit as je
 
     jax.config.update("jax_enable_x64", True)
 
     mine = calib.load_calibration("calibration.h5")
-    sizes = calib.export_c(mine, "skin.h", place="half")  # C99, for a microcontroller
+    sizes = calib.export_c(mine, "skin.h", place=je.LevelCentroid(0.5))  # C99, for a microcontroller
     print(f"{sizes.flash} bytes of flash, {sizes.ram} of memory")
     print(calib.export_csv("forcemap.h5", "forces.csv"))  # of calib.apply, for spreadsheets and pandas
     bag = calib.export_mcap("forcemap.h5", "forcemap.mcap")  # messages of ROS 2

@@ -9,10 +9,11 @@ import jaxeit as je
 from ..calibration.calibration import Calibration
 from ..calibration.localisation.ellipses import INSIDE_90, placement_covariance
 from ..calibration.localisation.locators import CentroidLocator, ContactLocator
+from ..calibration.localisation.press_images import REPORTED_ESTIMATORS
 
 LARGER = 5  # times that ellipses are drawn larger, since they would hardly be seen
 SMALL = 0.02  # half axis over the longer side of the sheet, below which ellipses are drawn larger
-IMAGE_ESTIMATOR = "quarter"  # where the calibration has no locator
+IMAGE_ESTIMATOR = "quarter"  # of `REPORTED_ESTIMATORS`, where the calibration has no locator
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +54,10 @@ def example_contacts(calibration: Calibration, image: np.ndarray) -> ExampleCont
         present, position = np.asarray(found.present)[:, 0], np.asarray(found.position)[:, 0]
         covariance = np.asarray(found.covariance)[:, 0, :2, :2] + placement_covariance(calibration)
         return ExampleContacts("fitted", np.where(present[:, None], position, np.nan), covariance)
-    centroid = locator.estimator if isinstance(locator, CentroidLocator) else IMAGE_ESTIMATOR
-    estimator = "fitted" if isinstance(locator, CentroidLocator) else centroid
-    position = np.asarray(je.metrics.ESTIMATORS[centroid](image, calibration.recon))
-    covariance = placement_covariance(calibration, estimator)
-    return ExampleContacts(estimator, position, np.broadcast_to(covariance, (len(position), 2, 2)))
+    if isinstance(locator, CentroidLocator):
+        name, estimator = "fitted", locator.estimator
+    else:
+        name, estimator = IMAGE_ESTIMATOR, REPORTED_ESTIMATORS[IMAGE_ESTIMATOR]
+    position = np.asarray(estimator(image, calibration.recon))
+    covariance = placement_covariance(calibration, name)
+    return ExampleContacts(name, position, np.broadcast_to(covariance, (len(position), 2, 2)))

@@ -18,7 +18,7 @@ from typing import Any, Generic, TypeVar, cast
 
 from ..spelling import did_you_mean
 from ..toml import TomlError, TomlTable, parse_values
-from .settings import Part, fields_of, settings_of, word
+from .settings import Part, fields_of, settings_of
 
 T = TypeVar("T")
 
@@ -39,6 +39,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         group: the group of entry points by which other packages add classes.
         spell: makes the name of a class that states none; default: `TotalVariation` is "total-variation".
         parts: registries of the objects that settings may hold.
+        words: short words that `make` takes for a choice with its settings, as "half" for "level-centroid:level=0.5".
 
     Example:
         from jaxeit.registry import AbstractChoice, Registry, computed
@@ -59,9 +60,11 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         group: str,
         spell: Callable[[str], str] | None = None,
         parts: tuple[Part, ...] = (),
+        words: Mapping[str, str] | None = None,
     ):
         self.base = cast(type[T], base)  # declared as a function, since mypy refuses an abstract class as `type[T]`
         self.kind, self.group, self.parts = kind, group, parts
+        self.words: Mapping[str, str] = dict(words or {})
         self._spell = spell or kebab_case
         self._room = base.__module__.rpartition(".")[0] + "."
 
@@ -116,9 +119,10 @@ class Registry(Mapping[str, type[T]], Generic[T]):
     def _hint(self, name: str) -> str:
         """What may be meant by an unknown name."""
         module, dot, own = name.rpartition(".")
-        known = ", ".join(f'"{known}"' for known in self.names)
+        names = (*self.names, *self.words)
+        known = ", ".join(f'"{known}"' for known in names)
         path = f"write a class of your own as {module + ':' + own!r}"
-        return did_you_mean(name, self.names, path if dot else f"give one of {known}")
+        return did_you_mean(name, names, path if dot else f"give one of {known}")
 
     def name_of(self, thing: T | type[T]) -> str:
         """The name of a class or of an object's class; its import path if it is neither shipped nor installed."""
@@ -170,7 +174,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
     # --- from text to objects and back -------------------------------------------------------------------------------
 
     def make(self, text: str, allow_import: bool = False, **given: Any) -> T:
-        """The object that a word describes: a name, then settings as in ``sparse-bayes:steps=30``.
+        """The object that a word describes: a name, then settings as in ``sparse-bayes:steps=30``; or a short word.
 
         Args:
             given: fields that do not come from the text.
@@ -178,7 +182,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         Raises:
             ValueError: for a name or a setting that does not exist, or a value of the wrong kind.
         """
-        name, settings = split_word(text)
+        name, settings = split_word(self.words.get(text, text))
         return _made(
             self.find(name, allow_import), TomlTable(settings, f"{self.kind} {text!r}", allow_import), given, self.parts
         )
@@ -206,7 +210,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         """The word from which `make` makes the object again: its name, and settings that differ from their defaults."""
         known = settings_of(type(thing), self.parts).values()
         values = [(setting, getattr(thing, setting.name)) for setting in known]
-        words = [f"{s.name}={word(s.plain(value))}" for s, value in values if not s.is_default(value)]
+        words = [f"{s.name}={s.word(value)}" for s, value in values if not s.is_default(value)]
         return self.name_of(thing) + (":" + ",".join(words) if words else "")
 
 

@@ -35,6 +35,9 @@ class Part(Protocol):
     def settings(self, thing: Any) -> dict[str, Any]:
         """The values of the TOML table from which `read` makes the object again."""
 
+    def text(self, thing: Any) -> str:
+        """The word from which `make` makes the object again."""
+
 
 def computed() -> Any:
     """A field that the class computes itself and that text cannot give; None until then."""
@@ -160,6 +163,10 @@ class Setting:
         if isinstance(value, enum.Enum):
             return value.value
         return _plain_numbers(np.asarray(value)) if self.part is None else self.part.settings(value)
+
+    def word(self, value: Any) -> str:
+        """A value as the command line writes it; an object by its name and settings."""
+        return word(self.plain(value)) if self.part is None or value is None else self.part.text(value)
 
     def is_default(self, value: Any) -> bool:
         """Whether this value is the default of the class."""

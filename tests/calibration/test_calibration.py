@@ -209,9 +209,7 @@ def located(grid):
     with calib.open_session(grid) as session:
         return calib.calibrate(
             [session],
-            recipe=replace(
-                QUICK, location=calib.fitting.Bilinear(nodes=2, shared=True), locator=calib.ImageCentroid("half")
-            ),
+            recipe=replace(QUICK, location=calib.fitting.Bilinear(nodes=2, shared=True), locator=calib.ImageCentroid()),
         )
 
 
@@ -314,7 +312,7 @@ def test_places_of_any_number_of_frames_take_one_program(calibration):
             return super().__call__(dv, *others)
 
     frames = rng.normal(0, 1e-4, (130, recon.readings))
-    found = [locate(Counted("half"), frames[:n], recon, calibration.masks) for n in (3, 70, 130)]
+    found = [locate(Counted(je.LevelCentroid(0.5)), frames[:n], recon, calibration.masks) for n in (3, 70, 130)]
     assert rows == [ROWS] * (1 + 2 + 3)
     for some in found[:2]:
         np.testing.assert_allclose(some.position, np.asarray(found[2].position)[: len(some.position)], atol=1e-9)

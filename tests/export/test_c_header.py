@@ -196,13 +196,14 @@ def compare(calibration, recorded, program, exact=False):
 def compare_places(calibration, found, image, rounding):
     """Compare the places of frames. Returns where rounding cannot decide which pixels count, and bounds of the error
     of the forces: that of the formulas, and that of places that follow the values of the image."""
-    name = calibration.locator.estimator
-    wanted = np.asarray(je.metrics.ESTIMATORS[name](image, calibration.recon))
+    estimator = calibration.locator.estimator
+    peak = isinstance(estimator, je.metrics.Peak)
+    wanted = np.asarray(estimator(image, calibration.recon))
     largest = image.max(1, keepdims=True)
-    level = {"half": 0.5, "quarter": 0.25, "peak": 1.0}.get(name)
+    level = 1.0 if peak else getattr(estimator, "level", None)
     edge = largest * (level or 0)
     near = (np.abs(image - edge) < 2 * rounding[:, None] * np.abs(image).max(1, keepdims=True)).sum(1)
-    clear = (near <= (name == "peak")) if level else np.ones(len(image), bool)
+    clear = (near <= peak) if level else np.ones(len(image), bool)
     assert clear.mean() > 0.8
     error = np.linalg.norm(found["place"] - wanted, axis=1)
     moved = 0 if level else rounding
@@ -231,7 +232,7 @@ def gain_field(field, skin, rng):
 def located(calibration, field, place, skin=None):
     """The calibration with a correction by location, at places of the image; a skin other than its own tells sides."""
     gains = gain_field(field, skin or calibration.skin, np.random.default_rng(2))
-    return replace(calibration, field=gains, locator=CentroidLocator(place))
+    return replace(calibration, field=gains, locator=CentroidLocator(je.metrics.ESTIMATORS.make(place)))
 
 
 def variants(calibration):
@@ -329,7 +330,7 @@ def test_places_of_the_image_stand_in_for_fits_and_what_it_changes_is_told(calib
         fitted, tmp_path, r"location: contacts are fitted.*--locator image-centroid.*--place half.*--without-location"
     )
     told = []
-    calib.export_c(fitted, tmp_path / "skin.h", place="half", tell=told.append)
+    calib.export_c(fitted, tmp_path / "skin.h", place=je.LevelCentroid(0.5), tell=told.append)
     compare(by_image, recorded, built(tmp_path))
 
     own, theirs, plain = (
@@ -342,7 +343,21 @@ def test_places_of_the_image_stand_in_for_fits_and_what_it_changes_is_told(calib
     assert re.findall(r"[\d.e+]+ N", told[1]) == rms
     header = " ".join((tmp_path / "skin.h").read_text().split())
     assert " ".join(told) in header
-    assert "at the place of the image by the estimator 'half'" in header
+    assert "at the place of the image by the estimator 'level-centroid:level=0.5'" in header
+
+
+class Lowest(je.LevelCentroid):
+    """An estimator of a user's own; what it is derived from does not say its formula."""
+
+
+def test_only_an_estimator_with_a_formula_gives_the_place(calibration, tmp_path, monkeypatch):
+    fitted = located(calibration, FIELDS.make("edge"), "half")
+    refused(fitted, tmp_path, f"place '{__name__}:Lowest:level=0.4': has no formula in C", place=Lowest(0.4))
+    monkeypatch.setattr(calib.calibration, "load_calibration", lambda path: fitted)
+    export = ["export", "c", "calibration.h5", "-o", str(tmp_path / "skin.h"), "--place"]
+    assert main([*export, "level-centroid:level=0.4"]) == 0
+    assert "value >= 0.4f * top" in (tmp_path / "skin.h").read_text()
+    assert main([*export, f"{__name__}:Lowest"]) == main([*export, "middle"]) == 2
 
 
 @pytest.mark.slow
@@ -446,14 +461,14 @@ def test_what_cannot_be_exported_is_refused(calibration, model, tmp_path):
     located = replace(calibration, field=stand_in(FittedField))
     own = type("Own", (calib.fitting.PadEdge,), {"name": "own"})()
     refused(
-        replace(located, field=stand_in(FittedField, field=own), locator=CentroidLocator("half")),
+        replace(located, field=stand_in(FittedField, field=own), locator=CentroidLocator(je.LevelCentroid(0.5))),
         tmp_path,
         "location .*: has no formula in C",
     )
     refused(located, tmp_path, r"location.*--without-location")
-    refused(located, tmp_path, "of no use", without_location=True, place="half")
-    refused(calibration, tmp_path, "has no correction by location", place="half")
-    refused(located, tmp_path, "place 'middle': no such estimator.*half", place="middle")
+    refused(located, tmp_path, "of no use", without_location=True, place=je.LevelCentroid(0.5))
+    refused(calibration, tmp_path, "has no correction by location", place=je.LevelCentroid(0.5))
+    refused(located, tmp_path, "place: 'half' is not an estimator; give an object, such as je.Level", place="half")
     assert calib.export_c(located, tmp_path / "skin.h", without_location=True).flash > 0
     assert "correction by location is left out" in (tmp_path / "skin.h").read_text()
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calib.calibration.localisation.locators import ImageCentroid
+from calib.calibration.localisation.locators import LOCATORS, ImageCentroid
 from calib.fitting.fields import (
     FittedField,
     PadEdge,
@@ -128,5 +128,7 @@ def test_presses_of_unknown_shares_are_left_out_and_a_fit_that_fails_corrects_no
 
 
 def test_an_estimator_that_is_not_there_is_refused_with_those_that_are():
-    with pytest.raises(ValueError, match="no estimator 'best'; there are: peak"):
-        ImageCentroid("best")
+    with pytest.raises(ValueError, match=r"no estimator 'best'; give one of .peak., .*.half., .quarter."):
+        LOCATORS.make("image-centroid:estimator=best")
+    with pytest.raises(ValueError, match=r"ImageCentroid: 'half' is not an estimator; give an object, such as "):
+        ImageCentroid("half")

@@ -202,7 +202,7 @@ def recorded(tmp_path_factory):
     return folder
 
 
-IMAGES = calib.Recipe(location=calib.PadEdge(), locator=calib.ImageCentroid("half"))
+IMAGES = calib.Recipe(location=calib.PadEdge(), locator=calib.ImageCentroid())
 CONTACTS = calib.Recipe(location=calib.PadEdge())
 
 

@@ -12,6 +12,7 @@ import pytest
 import calib
 import jaxeit as je
 from calib import calibration
+from calib.calibration.localisation.locators import CentroidLocator, locator_from_numbers, locator_numbers
 from calib.fitting import CURVES, FIELDS
 from jaxeit.linalg import Dense
 
@@ -83,6 +84,16 @@ class Adjoint(je.imaging.AbstractLinearMethod):
 
     def image(self, problem, y):
         return problem.jacobian.T @ y
+
+
+class Middle(je.metrics.AbstractEstimator):
+    """The centroid of all pixels, weighted by a power of their values."""
+
+    power: float = 1.0
+
+    def __call__(self, image, recon):
+        weight = jnp.maximum(image, 0) ** self.power * recon.areas
+        return weight @ recon.centres / weight.sum(-1, keepdims=True)
 
 
 class BigPoint(je.PointElectrode):
@@ -210,6 +221,26 @@ def test_an_electrode_in_a_skin_file(own, tmp_path):
     assert {type(electrode).__name__ for electrode in skin.electrodes} == {"BigPoint"}
 
 
+def test_an_estimator_in_a_recipe_and_in_a_calibration(own):
+    word = f"image-centroid:estimator={own}:Middle:power=2.0"
+    recipe = calib.Recipe.from_toml(f'location = "edge"\nlocator = "{word}"\n', allow_import=True)
+    assert calibration.LOCATORS.text(recipe.locator) == word
+    assert calib.Recipe.from_toml(recipe.to_toml()) == recipe
+    numbers = locator_numbers(CentroidLocator(recipe.locator.estimator))
+    assert locator_from_numbers(numbers, "float64").estimator == recipe.locator.estimator
+    del sys.modules[own]
+    with pytest.raises(ValueError, match=f"estimator '{own}:Middle' is code outside jaxeit"):
+        locator_from_numbers(numbers, "float64")
+
+
+@pytest.mark.parametrize(("word", "level"), [("half", 0.5), ("quarter", 0.25)])
+def test_the_estimators_of_earlier_files_are_found(word, level):
+    """Recipes and calibrations were written with these words."""
+    recipe = calib.Recipe.from_toml(f'locator = {{type = "image-centroid", estimator = "{word}"}}')
+    assert recipe.locator.estimator == je.LevelCentroid(level)
+    assert locator_from_numbers({"estimator": np.array([word])}, "float64").estimator == je.LevelCentroid(level)
+
+
 def test_a_field(own):
     field = FIELDS.make(f"{own}:Slope", allow_import=True)
     assert FIELDS.text(field) == f"{own}:Slope"
@@ -218,11 +249,12 @@ def test_a_field(own):
 
 def test_the_page_lists_every_kind_with_its_entry_point_group():
     page = (Path(__file__).parents[2] / "docs" / "own-classes.md").read_text()
-    rooms = [je.effects, je.skin, je.imaging, je.model, je.linalg, je.scan, calib.fitting, calib.presses, calibration]
-    groups = {thing.group for room in rooms for thing in vars(room).values() if isinstance(thing, je.registry.Registry)}
+    ours = [module for name, module in sys.modules.items() if name.partition(".")[0] in ("jaxeit", "calib")]
+    things = [thing for module in ours for thing in list(vars(module).values())]
+    groups = {thing.group for thing in things if isinstance(thing, je.registry.Registry)}
     listed = re.findall(r"\| `(\w+\.\w+)` \|$", page, re.MULTILINE)
     assert sorted(listed) == sorted({*groups, "calib.importers"})
-    assert groups >= {"jaxeit.effects", "jaxeit.electrodes", "jaxeit.priors", "calib.curves", "calib.losses"}
+    assert groups >= {"jaxeit.effects", "jaxeit.electrodes", "jaxeit.estimators", "jaxeit.criteria", "calib.losses"}
 
 
 class Halved(calib.presses.AbstractCorrection):

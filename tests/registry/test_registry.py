@@ -16,12 +16,14 @@ from calib.presses import BASELINES, CORRECTIONS
 from jaxeit.effects import EFFECTS
 from jaxeit.imaging import HYPERPARAMETERS, METHODS, NOISES, PRIORS
 from jaxeit.linalg import SOLVERS
+from jaxeit.metrics import ESTIMATORS
 from jaxeit.model import BASES
 from jaxeit.registry import registry as module
 from jaxeit.skin import ELECTRODES
 
 CHOICES = [
-    EFFECTS, CURVES, FIELDS, LOSSES, LOCATORS, BASELINES, CORRECTIONS, PRIORS, METHODS, HYPERPARAMETERS, NOISES, BASES
+    EFFECTS, CURVES, FIELDS, LOSSES, LOCATORS, BASELINES, CORRECTIONS, PRIORS, METHODS, HYPERPARAMETERS, NOISES, BASES,
+    ESTIMATORS,
 ]  # fmt: skip
 ALL = [*CHOICES, ELECTRODES]
 MAKEABLE = [(registry, name) for registry in CHOICES for name in registry]
@@ -56,6 +58,11 @@ def test_what_is_made_of_a_name_is_described_by_that_name(registry, name):
         (CURVES, "play:widths=[100,200]", "play:widths=[100.0,200.0]"),
         (LOCATORS, "fitted-contact:most=3,widths=[0.01,0.02]", None),
         (LOCATORS, "image-centroid:estimator=peak", None),
+        (LOCATORS, "image-centroid:estimator=level-centroid:level=0.4", None),
+        (LOCATORS, "image-centroid:estimator=positive", "image-centroid:estimator=positive-centroid"),
+        (LOCATORS, "image-centroid:estimator=half", "image-centroid"),
+        (ESTIMATORS, "half", "level-centroid:level=0.5"),
+        (ESTIMATORS, "quarter", "level-centroid"),
         (EFFECTS, "Noise:std=0.5,stream=pressure", None),
         (EFFECTS, "ElectrodeFault:electrode=[1,2],resistance=5", "ElectrodeFault:electrode=[1,2],resistance=5.0"),
     ],

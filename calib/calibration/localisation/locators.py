@@ -6,7 +6,7 @@ neither mesh nor solver.
 
 import abc
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, get_type_hints
 
 import equinox as eqx
@@ -17,7 +17,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 import jaxeit as je
-from jaxeit.registry import Registry, limited, require_limits
+from jaxeit.kinds import require_kind
+from jaxeit.registry import Registry, SettingError, limited, require_limits
 
 from ...fitting.fields import Places, single_places
 
@@ -40,12 +41,12 @@ class AbstractLocator(eqx.Module):
 
 
 class CentroidLocator(AbstractLocator):
-    """One contact per frame, at the position that an estimator of `jaxeit.metrics.ESTIMATORS` gives."""
+    """One contact per frame, at the position that an estimator gives of its image."""
 
-    estimator: str = eqx.field(static=True)
+    estimator: je.metrics.AbstractEstimator
 
     def __call__(self, dv: Array, image: Array, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks) -> Places:
-        return single_places(je.metrics.ESTIMATORS[self.estimator](image, recon), masks.weights.shape[0])
+        return single_places(self.estimator(image, recon), masks.weights.shape[0])
 
 
 class ContactLocator(AbstractLocator):
@@ -100,17 +101,22 @@ class AbstractLocatorChoice(abc.ABC):
 
 @dataclass(frozen=True)
 class ImageCentroid(AbstractLocatorChoice):
-    """A named estimator of the image: quick to prepare; "half" has a mean error of 5 mm on the simulated testbed.
+    """An estimator of the place in the image: quick to prepare; the default has a mean error of 5 mm on the simulated
+    testbed.
+
+    | meaning                                                              | default                  |
+    |----------------------------------------------------------------------|--------------------------|
+    | estimator: one of `jaxeit.metrics.ESTIMATORS`, or a class of your own | ``je.LevelCentroid(0.5)`` |
 
     Raises:
-        ValueError: for a name that is not in `jaxeit.metrics.ESTIMATORS`.
+        SettingError: for what is no estimator.
     """
 
-    estimator: str = "half"
+    estimator: je.metrics.AbstractEstimator = field(default_factory=lambda: je.LevelCentroid(0.5))
 
     def __post_init__(self) -> None:
-        if self.estimator not in je.metrics.ESTIMATORS:
-            raise ValueError(f"no estimator {self.estimator!r}; there are: {', '.join(je.metrics.ESTIMATORS)}")
+        give = "an object, such as je.LevelCentroid(0.5)"
+        require_kind(self.estimator, je.metrics.AbstractEstimator, SettingError, "an estimator", give, "ImageCentroid")
 
     def prepare(
         self, model: je.Model, noise: np.ndarray, channels: np.ndarray, sigma: Array | None = None
@@ -144,7 +150,7 @@ class FittedContact(AbstractLocatorChoice):
         return ContactLocator(jax.tree.map(_rounded, finder))
 
 
-LOCATORS = Registry(AbstractLocatorChoice, "locator", "calib.locators")
+LOCATORS = Registry(AbstractLocatorChoice, "locator", "calib.locators", parts=(je.metrics.ESTIMATORS,))
 """Choices of locator by the names that the command line and recipes use."""
 
 
@@ -172,7 +178,7 @@ def locate(
 
     Example:
         noise, channels = frames[rest].std(0), np.asarray(mine.recon.channels)
-        for choice in (calib.ImageCentroid("half"), calibration.FittedContact(most=1)):
+        for choice in (calib.ImageCentroid(je.LevelCentroid(0.5)), calibration.FittedContact(most=1)):
             model = je.discretise(je.Scene(mine.skin), je.Fidelity.draft())
             locator = choice.prepare(model, noise, channels)
             print(calibration.LOCATORS.text(choice))
@@ -206,7 +212,7 @@ def _rows(values: np.ndarray, first: int) -> Array:
 def locator_numbers(locator: AbstractLocator) -> dict[str, np.ndarray]:
     """Every array and setting of a locator, by its path of field names joined by hyphens."""
     if isinstance(locator, CentroidLocator):
-        return {"estimator": np.array([locator.estimator])}
+        return {"estimator": np.array([je.metrics.ESTIMATORS.text(locator.estimator)])}
     return dict(_numbers(locator))
 
 
@@ -224,7 +230,7 @@ def _numbers(module: eqx.Module, at: str = "") -> Iterator[tuple[str, np.ndarray
 def locator_from_numbers(numbers: dict[str, np.ndarray], dtype: Any) -> AbstractLocator:
     """The locator that `locator_numbers` described; raises KeyError for a missing array."""
     if "estimator" in numbers:
-        return CentroidLocator(str(numbers["estimator"][0]))
+        return CentroidLocator(je.metrics.ESTIMATORS.make(str(numbers["estimator"][0])))
     locator: ContactLocator = _module(ContactLocator, numbers, "", dtype)
     return locator
 

@@ -1,5 +1,6 @@
 """Images of the frames of presses, and the places of the presses estimated from these frames."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,6 +15,11 @@ from ...fitting.fields import Places
 from ...presses.pooled import PooledPresses
 from ..recipe import Recipe
 from .locators import AbstractLocator, locate
+
+REPORTED_ESTIMATORS: Mapping[str, je.metrics.AbstractEstimator] = {
+    name: je.metrics.ESTIMATORS.make(name) for name in ("peak", "half", "quarter", "positive")
+}
+"""Estimators of the place whose errors an evaluation states, by their names there."""
 
 
 class PressImages(NamedTuple):
@@ -54,7 +60,7 @@ class Imager:
         """Images of presses (presses, readings) V, each of which holds one contact."""
         recon = self.recon
         image = recon(jnp.asarray(dv, recon.dtype))
-        estimated = {n: np.asarray(e(image, recon), float) for n, e in je.metrics.ESTIMATORS.items()}
+        estimated = {n: np.asarray(e(image, recon), float) for n, e in REPORTED_ESTIMATORS.items()}
         places = None
         if self.locator is not None:
             places = locate(self.locator.single(), dv, recon, self.masks, image)

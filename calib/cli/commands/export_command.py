@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Callable
 
-from ..arguments import prepare_results
+from ..arguments import of_option, prepare_results
 from ..terminal import progress_bar, say, show
 
 
@@ -23,7 +23,10 @@ def _add_header(header: argparse.ArgumentParser) -> None:
     header.add_argument("--prefix", default="skin", help=text)
     text = "leave out a correction by location: its gain is then 1"
     header.add_argument("--without-location", action="store_true", help=text)
-    text = "place of the contact by this estimator of the image, in place of the fits of the calibration; such as half"
+    text = (
+        "place of the contact by this estimator of the image, in place of the fits of the calibration; such as half or "
+        "level-centroid:level=0.4"
+    )
     header.add_argument("--place", metavar="ESTIMATOR", help=text)
 
 
@@ -68,13 +71,16 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _write_header(args: argparse.Namespace) -> object:
+    import jaxeit as je
+
     from ...calibration import load_calibration
     from ...export import export_c
 
     prepare_results(args, "output")
+    place = None if args.place is None else of_option("place", args.place, je.metrics.ESTIMATORS.make)
     calibration = load_calibration(args.calibration)
-    options = {"prefix": args.prefix, "without_location": args.without_location, "place": args.place}
-    return export_c(calibration, args.output, **options, tell=say)
+    options = {"prefix": args.prefix, "without_location": args.without_location}
+    return export_c(calibration, args.output, **options, place=place, tell=say)
 
 
 def _write_forces(args: argparse.Namespace) -> object:

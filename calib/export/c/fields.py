@@ -43,7 +43,7 @@ class LocationInC(NamedTuple):
 
     | meaning                                                                     | shape            | unit   |
     |-----------------------------------------------------------------------------|------------------|--------|
-    | estimator: the name of the estimator of the place                           |                  |        |
+    | estimator of the place, by its name and settings                            |                  |        |
     | weight: expression in C for the weight of pixel ``p`` in its mean           |                  |        |
     | field                                                                       |                  |        |
     | pixel: centre and area of each pixel                                        | (pixels, 3)      | m, m^2 |
@@ -93,7 +93,7 @@ def location_in_c(calibration: Calibration) -> LocationInC:
     low, high = start.min(1), start.max(1)
     recon = calibration.recon
     return LocationInC(
-        estimator=locator.estimator,
+        estimator=je.metrics.ESTIMATORS.text(locator.estimator),
         weight=_weight(locator.estimator),
         field=FORMULAS[name](fitted),
         pixel=np.column_stack([np.asarray(recon.centres, float), np.asarray(recon.areas, float)]),
@@ -104,15 +104,17 @@ def location_in_c(calibration: Calibration) -> LocationInC:
     )
 
 
-def _weight(name: str) -> str:
+def _weight(estimator: je.metrics.AbstractEstimator) -> str:
     """The weight of pixel ``p`` with the value ``value``; ``top`` is the largest value, ``total`` the sum so far."""
-    estimator = je.metrics.ESTIMATORS[name]
-    if isinstance(estimator, je.metrics.Peak):
+    kind = type(estimator)  # a class derived from one of these has another formula
+    if kind is je.metrics.Peak:
         return "top > 0.0f && value == top && total == 0.0f ? 1.0f : 0.0f"
-    if isinstance(estimator, je.metrics.LevelCentroid):
-        return f"top > 0.0f && value >= {_literal(estimator.level)} * top ? skin_pixel[p][2] : 0.0f"
-    if isinstance(estimator, je.metrics.PositiveCentroid):
+    if kind is je.metrics.LevelCentroid:
+        level = _literal(float(cast(je.metrics.LevelCentroid, estimator).level))
+        return f"top > 0.0f && value >= {level} * top ? skin_pixel[p][2] : 0.0f"
+    if kind is je.metrics.PositiveCentroid:
         return "value > 0.0f ? value * skin_pixel[p][2] : 0.0f"
+    name = je.metrics.ESTIMATORS.text(estimator)
     raise ExportError(f"place {name!r}: has no formula in C; give --place half, peak, quarter or positive")
 
 

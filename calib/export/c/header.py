@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
+import jaxeit as je
+
 from ...calibration import Calibration, LogCalibration
 from ...calibration.given import require_calibration
 from ...session import replacing
@@ -71,7 +73,7 @@ def export_c(
     *,
     prefix: str = "skin",
     without_location: bool = False,
-    place: str | None = None,
+    place: je.metrics.AbstractEstimator | None = None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> HeaderSizes:
     """Write a calibration as a C99 header, whole or not at all; returns what the header takes.
@@ -84,7 +86,7 @@ def export_c(
         path: of the header.
         prefix: of its names: a lower-case letter, then lower-case letters, digits and underscores.
         without_location: leave out a correction by location: its gain is then 1.
-        place: estimator of `jaxeit.metrics.ESTIMATORS` by which the header finds the place of a contact in the image;
+        place: estimator by which the header finds the place of a contact in the image, such as `jaxeit.LevelCentroid`;
             default: that of the calibration, which must then be an `ImageCentroid`.
         tell: called with each line on what another place than that of the calibration changes.
 
@@ -116,7 +118,7 @@ def export_c(
     return sizes
 
 
-def _require_choices(prefix: str, without_location: bool, place: str | None) -> None:
+def _require_choices(prefix: str, without_location: bool, place: je.metrics.AbstractEstimator | None) -> None:
     if not _PREFIX.fullmatch(prefix):
         raise ExportError(
             f"prefix {prefix!r}: give a lower-case letter, then lower-case letters, digits and underscores, 31 at most"

@@ -5,20 +5,21 @@ from dataclasses import replace
 import numpy as np
 
 import jaxeit as je
+from jaxeit.kinds import require_kind
 
 from ...calibration import Calibration, force_map
 from ...calibration.localisation.locators import CentroidLocator
 from ..errors import ExportError
 
 
-def with_image_places(calibration: Calibration, estimator: str) -> Calibration:
-    """The calibration with the place of a contact by this estimator of `jaxeit.metrics.ESTIMATORS`.
+def with_image_places(calibration: Calibration, estimator: je.metrics.AbstractEstimator) -> Calibration:
+    """The calibration with the place of a contact by this estimator of its image.
 
     Raises:
-        ExportError: for an unknown estimator, or a calibration without correction by location.
+        ExportError: for what is no estimator, or a calibration without correction by location.
     """
-    if estimator not in je.metrics.ESTIMATORS:
-        raise ExportError(f"place {estimator!r}: no such estimator; give one of {', '.join(je.metrics.ESTIMATORS)}")
+    give = "an object, such as je.LevelCentroid(0.5)"
+    require_kind(estimator, je.metrics.AbstractEstimator, ExportError, "an estimator", give, "place")
     if calibration.field is None:
         raise ExportError("place: the calibration has no correction by location; export without --place")
     return replace(calibration, locator=CentroidLocator(estimator))
