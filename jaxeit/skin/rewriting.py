@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Integer
@@ -24,12 +25,13 @@ SCAN_KEYS = ("pattern", "rows", "sense_channels")
 _POSITIONS = re.compile(rf"""^[ \t]*positions[ \t]*=[ \t]*{_ROWS}[^\n]*\n""", re.M)
 
 
-def with_positions(skin: Skin, positions: Float[np.ndarray, "electrodes 2"]) -> Skin:
+def with_positions(skin: Skin, positions: Float[Any, "electrodes 2"]) -> Skin:
     """The skin with its electrodes elsewhere; all other lines of its text stay as they are.
 
     Args:
         skin: from `load_skin`, with its text; its electrodes have ``positions`` or a ``grid``.
-        positions: of the electrodes' middles in the sheet's flat coordinates, m, in the order of their numbers.
+        positions: of the electrodes' middles in the sheet's flat coordinates, m, in the order of their numbers; an array
+            of NumPy or JAX.
 
     Raises:
         TomlError: if the skin has no text, its electrodes have no positions, or one would lie outside the sheet.

@@ -4,6 +4,7 @@ import importlib.resources
 from dataclasses import replace
 from itertools import permutations
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -332,6 +333,13 @@ def test_a_text_whose_rows_cannot_be_replaced_is_refused():
         je.skin.with_rows(je.skin.parse_skin(inline), ROWS)
     with pytest.raises(je.skin.ProtocolError, match="outside 0 to 24"):
         je.skin.with_rows(skin, ROWS + 10)
+
+
+def test_electrodes_are_moved_by_a_shift_of_jax(skin):
+    """As docs/electrodes.md does with the shift of a fit."""
+    shift = jnp.full((len(skin.electrodes), 2), 1e-3)
+    moved = je.skin.with_positions(skin, skin.electrode_positions + shift)
+    np.testing.assert_allclose(moved.electrode_positions, skin.electrode_positions + 1e-3, atol=1e-8)
 
 
 def test_a_skin_is_the_same_whatever_its_text(skin):
