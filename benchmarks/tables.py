@@ -336,7 +336,6 @@ ROWS: dict[str, Callable] = {
     "gpu_frames": _gpu_frames,
     "gpu_training": _gpu_training,
     "repeat": _repeat,
-    "images": _images,
     "priors": _priors,
     "methods": _methods,
     "fidelities": _fidelities,

@@ -199,10 +199,12 @@ def test_programs_about_import(root, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_programs_about_images(root, model, skin, touch):
+def test_programs_about_images_loads_and_tracks(root, model, skin, touch):
     frames = [(dv, 0.01, None, None) for dv in (0 * touch["dv"], touch["dv"], touch["dv"])]
     given = {"skin": skin, "frames": frames, "finder": je.prepare_contacts(model, noise=touch["noise"])}
-    names = run(root / "docs" / "methods.md", touch | given)
+    names = touch | given
+    for page in ("images.md", "loads.md", "tracks.md"):
+        run(root / "docs" / page, names)
     assert abs(float(names["figures"].position_error)) < 0.01
     assert 0.3 < float(names["likeness"]) <= 1
     place = jnp.array([0.06, 0.13])

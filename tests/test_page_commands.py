@@ -379,13 +379,13 @@ def test_programs_that_go_on_from_objects_of_the_reader(folder):
     with calib.open_session("session.h5") as session:  # many presses: of few, no layer is learned
         names |= given | {"session": session, "sessions": [session], "noise": noise, "v0": v0, "pad_errors": None}
         names |= {"skin": calibration.skin, "dv": dv, "places": places}
-        loads, *others = fragments("methods.md")
+        (learned, round_tips), layers = fragments("loads.md"), fragments("contact-layer.md")
         presses = calibration.probes
         taught = {"frames": presses.dv, "places": presses.position, "forces": presses.force}
-        exec(compile(loads, "methods.md", "exec"), names | {key: part[:6] for key, part in taught.items()})
-        assert len(others) == 3
-        for program in others:
-            exec(compile(program, "methods.md", "exec"), names)
+        exec(compile(learned, "loads.md", "exec"), names | {key: part[:6] for key, part in taught.items()})
+        assert len(layers) == 2
+        for program in (round_tips, *layers):
+            exec(compile(program, "loads.md, contact-layer.md", "exec"), names)
         (electrodes,) = fragments("electrodes.md")
         exec(compile(electrodes, "electrodes.md", "exec"), names)
     assert np.isfinite(names["mean"]).all()

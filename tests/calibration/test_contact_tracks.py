@@ -239,5 +239,5 @@ def test_two_contacts_are_followed_from_the_command_line(tmp_path, capsys):
 
 
 def test_apply_names_its_arrays_as_documented(root):
-    text = (root / "docs" / "methods.md").read_text()
+    text = (root / "docs" / "tracks.md").read_text()
     assert all(name in text.split("tracks/...")[1] for name in ABOUT)
