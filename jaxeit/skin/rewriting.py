@@ -30,8 +30,8 @@ def with_positions(skin: Skin, positions: Float[Any, "electrodes 2"]) -> Skin:
 
     Args:
         skin: from `load_skin`, with its text; its electrodes have ``positions`` or a ``grid``.
-        positions: of the electrodes' middles in the sheet's flat coordinates, m, in the order of their numbers; an array
-            of NumPy or JAX.
+        positions: of the electrodes' middles in the sheet's flat coordinates, m, in the order of their numbers; an
+            array of NumPy or JAX.
 
     Raises:
         TomlError: if the skin has no text, its electrodes have no positions, or one would lie outside the sheet.
