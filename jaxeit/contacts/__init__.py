@@ -30,6 +30,7 @@ Example:
 """
 
 from .loads import (
+    AbstractGain,
     ForceLaw,
     LoadFitter,
     LoadKind,
@@ -51,6 +52,7 @@ from .search import ContactFinder
 from .settings import ContactSettings
 
 __all__ = [
+    "AbstractGain",
     "ContactFinder",
     "ContactResult",
     "ContactSettings",

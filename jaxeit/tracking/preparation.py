@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 
 from .._compile import full_precision, verb
 from ..contacts.bump_responses import points_of
-from ..contacts.loads.preparation import field_modes
 from ..contacts.preparation import prepare_contacts
 from ..contacts.settings import ContactSettings
 from ..fusion import pad_masks
@@ -22,6 +21,7 @@ from ..linalg.base import on_device
 from ..model.bases import Pixels
 from ..model.discretisation import Model, discretise
 from ..model.forward_model import conductivity
+from ..model.gaussian_field import field_modes
 from ..model.scene import Scene
 from ..model.sensitivity import pair_jacobian
 from ..skin.description import Skin
@@ -114,7 +114,7 @@ def _loaded_sheet(
     )
     centres = np.asarray(fine.centres, float)
     chart, middles = np.asarray(coarse.chart, float), np.asarray(coarse.centroids, float)
-    field = GainField.over(np.stack([chart.min(0), chart.max(0)]), middles, loads, settings.level)
+    field = GainField.on_sheet(np.stack([chart.min(0), chart.max(0)]), middles, loads, settings.level)
     reanalysis = prepare_reanalysis(coarse, jnp.asarray(mean, coarse.dtype), pairs, mixing, light(0).dtype)
     of_coat = light(_coat_modes(coarse, coat, loads.coat_length))
     sheet = LoadedSheet(

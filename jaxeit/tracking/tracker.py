@@ -92,7 +92,7 @@ class Tracker:
         """
         layer = LearnedLayer.unknown(self.field) if layer is None else layer
         self.field.require_same(layer.field)
-        layer = layer._replace(field=self.field)  # what errors of sheet and mesh look like is known of this tracker
+        layer = replace(layer, field=self.field)  # what errors of sheet and mesh look like is known of this tracker
         return Tracking(self._untouched(layer), layer)
 
     def _untouched(self, layer: LearnedLayer) -> Belief:

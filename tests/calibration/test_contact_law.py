@@ -20,7 +20,9 @@ from .damage import damage
 PLACE, WIDTH, SECOND = np.array([0.05, 0.05]), 0.012, 10**9
 WEAKER = 0.5  # true force over that of readings alone
 CORNERS = np.array([[0.0, 0.0], [0.2, 0.2]])
-LAYER = LearnedLayer.unknown(GainField.over(CORNERS, CORNERS, je.contacts.LoadSettings(gain_length=0.05), level=0.3))
+LAYER = LearnedLayer.unknown(
+    GainField.on_sheet(CORNERS, CORNERS, je.contacts.LoadSettings(gain_length=0.05), level=0.3)
+)
 
 
 def track(force, number=1, place=PLACE):
@@ -60,7 +62,7 @@ class FakeTracker(Tracker):
         return self.step(self.start(layer), dv, 0.5)
 
     def learned(self, now):
-        return LAYER._replace(contacts=now.begun)
+        return replace(LAYER, contacts=now.begun)
 
     def told_by_pads(self, tracks, pad_errors=None):
         told = pad_errors is not None and bool(np.isfinite(pad_errors).any())

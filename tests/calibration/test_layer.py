@@ -35,7 +35,7 @@ def layer():
     """Learned from seven contacts."""
     rng = np.random.default_rng(0)
     corners = np.array([[0.0, 0.0], [0.2, 0.2]])
-    field = GainField.over(corners, rng.uniform(0, 0.2, (50, 2)), LoadSettings(gain_length=0.05), level=0.3)
+    field = GainField.on_sheet(corners, rng.uniform(0, 0.2, (50, 2)), LoadSettings(gain_length=0.05), level=0.3)
     field = replace(field, sheet_error=0.1 * rng.normal(size=(len(field.places), 4)), mesh_error=0.02)
     half = np.eye(len(field.places)) - 0.2
     return LearnedLayer.normal(field, rng.normal(size=len(half)), half @ half.T / len(half), 7)
@@ -72,7 +72,7 @@ class FakeTracker(Tracker):
         return np.full(len(tracks), errors is not None)
 
     def learned(self, now):
-        return self.tells._replace(contacts=now.begun + (0 if now.layer is None else now.layer.contacts))
+        return replace(self.tells, contacts=now.begun + (0 if now.layer is None else now.layer.contacts))
 
 
 def better_with_contacts(tracker, dv, forces, errors, layer):
@@ -108,7 +108,7 @@ def session(presses, tmp_path_factory):
 
 
 def test_a_calibration_keeps_the_layer(calibration, layer, tmp_path):
-    layer = layer._replace(means=layer.means + layer.evidence[:, None])  # one for each variance
+    layer = replace(layer, means=layer.means + layer.evidence[:, None])  # one for each variance
     replace(calibration, layer=layer).save(tmp_path / "c.h5")
     found = calib.load_calibration(tmp_path / "c.h5").layer
     for name in ("means", "covariances", "contacts", "evidence"):

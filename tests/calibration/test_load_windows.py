@@ -77,7 +77,7 @@ def asked(calibration, monkeypatch):
 
 def test_loads_are_fitted_with_the_layer_that_the_calibration_learned(calibration, asked):
     corners = np.array([[0.0, 0.0], [0.2, 0.2]])
-    layer = LearnedLayer.unknown(GainField.over(corners, corners, je.contacts.LoadSettings(gain_length=0.05), 0.3))
+    layer = LearnedLayer.unknown(GainField.on_sheet(corners, corners, je.contacts.LoadSettings(gain_length=0.05), 0.3))
     for known in (layer, None):
         assert asked(replace(calibration, layer=known, probes=None)) == (known, None)
 

@@ -1,7 +1,6 @@
 """Loads fitted through the pressure law: what they are, how many, where, and how sure."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,9 +10,8 @@ import pytest
 
 import jaxeit as je
 from calib.calibration.localisation.load_windows import LOAD_FIDELITY
-from jaxeit.contacts import LoadKind, LoadSettings, prepare_loads
+from jaxeit.contacts import AbstractGain, LoadKind, LoadSettings, prepare_loads
 from jaxeit.contacts.loads.comparison import Comparison, Fit, padded
-from jaxeit.contacts.loads.preparation import field_modes
 from jaxeit.contacts.loads.pressure import (
     LOAD_PARAMETERS,
     MAX_LOADS,
@@ -26,6 +24,7 @@ from jaxeit.contacts.loads.pressure import (
 )
 from jaxeit.imaging import InverseError
 from jaxeit.model.forward_model import coefficients, transfer
+from jaxeit.model.gaussian_field import field_modes
 from tests.compiled import compiled
 
 from .touches import GAIN, TOUCHES, frames_of, pair, ring, single, tilted
@@ -235,13 +234,13 @@ def test_what_is_not_known_of_the_coat_moves_the_readings_of_a_load(ready):
     assert np.linalg.norm(seen - slopes[:, strongest]) < 0.25 * np.linalg.norm(seen)
 
 
-class Gain(NamedTuple):
+class Gain(AbstractGain):
     """A gain of the contact layer that is known: its mean at points, from which a mode differs as the settings say."""
 
     mean: Callable[[np.ndarray], np.ndarray]
     deviation: float
 
-    def over(self, points):
+    def distribution(self, points):
         modes = LoadSettings().gain * field_modes(points, LoadSettings().gain_length)
         return self.mean(points), modes, self.deviation**2 * np.eye(modes.shape[1])
 
@@ -294,14 +293,6 @@ def test_a_gain_that_is_known_places_loads_where_they_are(ready):
     before, after = np.array(away).T
     assert after.max() < 0.8e-3
     assert after.mean() < 0.6 * before.mean()
-
-
-def test_fields_that_are_not_known_have_their_size_and_length():
-    points = np.random.default_rng(2).uniform(0.05, 0.15, (60, 2))
-    corners = np.array([[0.0, 0.0], [0.2, 0.2]])
-    modes = field_modes(np.concatenate([points, corners]), 0.015)[:60]
-    distance = np.linalg.norm(points[:, None] - points, axis=-1)
-    np.testing.assert_allclose(modes @ modes.T, np.exp(-(distance**2) / (2 * 0.015**2)), atol=0.12)
 
 
 def test_covariances_grow_with_the_gain_that_is_not_known(ready):

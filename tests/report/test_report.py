@@ -484,7 +484,7 @@ def test_the_calibrated_force_has_a_third_map_where_it_is_not_the_papers(calibra
 def test_a_layer_that_was_learned_has_two_maps(located, written, tmp_path):
     """They are the field's own mean and deviation, and nothing is drawn off the sheet."""
     corners = np.array([[0.0, 0.0], [0.2, 0.2]])
-    field = GainField.over(corners, np.random.default_rng(0).uniform(0, 0.2, (99, 2)), LoadSettings(), 0.3)
+    field = GainField.on_sheet(corners, np.random.default_rng(0).uniform(0, 0.2, (99, 2)), LoadSettings(), 0.3)
     count = len(field.places)
     layer = LearnedLayer.normal(field, np.linspace(-1, 1, count), np.eye(count), contacts=12)
     known = replace(located, layer=layer, contact_law=ContactLaw.unknown()._replace(contacts=12))

@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import chi2
 
 import jaxeit as je
-from jaxeit.contacts.loads.preparation import field_modes
 from jaxeit.contacts.loads.pressure import Form, line_shapes, shape_directions
+from jaxeit.model.gaussian_field import field_modes
 from jaxeit.tracking import prepare_tracker
 from jaxeit.tracking.belief.consider import ConsiderErrors
 from jaxeit.tracking.belief.response import SHORTEST, load_pressure

@@ -65,7 +65,7 @@ def test_the_field_has_the_covariance_of_the_kernel():
     rng = np.random.default_rng(0)
     points = rng.uniform(0.03, 0.17, (40, 2))
     loads = LoadSettings()
-    field = GainField.over(np.array([[0.0, 0.0], [0.2, 0.2]]), points, loads, level=0.3)
+    field = GainField.on_sheet(np.array([[0.0, 0.0], [0.2, 0.2]]), points, loads, level=0.3)
     modes = field.modes_at(points)
     square = ((points[:, None] - points) ** 2).sum(-1)
     expected = 0.3**2 + loads.gain**2 * np.exp(-square / (2 * loads.gain_length**2))
@@ -194,10 +194,10 @@ def test_the_effect_of_a_press_does_not_move_contacts_and_is_in_the_error_of_for
 def test_the_gain_for_fits_of_loads_is_that_of_the_next_press(layer):
     """Its covariance is that of the layer and an effect of the press."""
     points = np.array(PLACES)
-    mean, modes, covariance = layer.over(points)
+    mean, modes, covariance = layer.distribution(points)
     of_layer, deviation = layer.at(points)
     np.testing.assert_array_equal(mean, of_layer)
-    of_readings = layer._replace(field=replace(layer.field, mesh_error=0.0)).at(points)[1]
+    of_readings = replace(layer, field=replace(layer.field, mesh_error=0.0)).at(points)[1]
     assert (deviation > of_readings).all()  # what the mesh errs by tells forces as gain does
     effect = layer.press_variance * (modes**2).sum(1)
     np.testing.assert_allclose(((modes @ covariance) * modes).sum(1), of_readings**2 + effect)
@@ -233,7 +233,7 @@ def test_learning_goes_on_where_it_ended(tracker, layer):
 
 def test_a_layer_has_its_trackers_own_errors_of_sheet_and_mesh(tracker, layer):
     """It may have been learned with another fit of the sheet, or under another model error."""
-    other = layer._replace(field=replace(layer.field, mesh_error=0.5))
+    other = replace(layer, field=replace(layer.field, mesh_error=0.5))
     assert tracker.start(other).layer.field is tracker.field
 
 
@@ -252,7 +252,7 @@ def test_a_layer_of_another_sheet_is_refused(tracker, layer):
     moved = replace(layer.field, places=layer.field.places + 0.01)
     for field in (moved, replace(layer.field, deviation=0.2)):
         with pytest.raises(InverseError, match="learned on another sheet or under other settings"):
-            tracker.start(layer._replace(field=field))
+            tracker.start(replace(layer, field=field))
 
 
 SMALL = GainField(
@@ -283,7 +283,7 @@ def after_presses(rng, counts, variance):
 
 def known_variance(variance, field=SMALL):
     """Nothing is learned but how far presses differ."""
-    return LearnedLayer.unknown(field)._replace(evidence=np.where(variance == PRESS_VARIANCES, 0.0, -1e3))
+    return replace(LearnedLayer.unknown(field), evidence=np.where(variance == PRESS_VARIANCES, 0.0, -1e3))
 
 
 def test_without_an_effect_of_the_press_the_layer_is_the_belief_of_the_press():
@@ -330,7 +330,7 @@ def test_errors_that_all_presses_share_are_in_the_deviation():
         errors = field.errors() @ np.random.default_rng([706, seed]).normal(size=3 + 7)
         for layer, shown in after_presses(np.random.default_rng([707, seed]), (30,), 0.01):
             for known in (SMALL, field):  # without these errors, and with them
-                mean, deviation = layer._replace(field=known).at(points)
+                mean, deviation = replace(layer, field=known).at(points)
                 found.append(np.abs(mean - told @ (shown - errors)) < INTERVAL * deviation)
     without, covered = np.mean(found[::2]), np.mean(found[1::2])
     assert without < 0.7
@@ -382,7 +382,7 @@ def test_no_single_press_rules_a_variance_out():
 @pytest.mark.slow
 def test_after_a_press_the_next_one_has_an_effect_of_its_own(tracker, frame_of):
     """The gain with which the next press begins is the layer and the effect; and no press, no lesson."""
-    start = LearnedLayer.unknown(tracker.field)._replace(evidence=np.linspace(-30, 0, len(PRESS_VARIANCES)))
+    start = replace(LearnedLayer.unknown(tracker.field), evidence=np.linspace(-30, 0, len(PRESS_VARIANCES)))
     now = tracker.start(start)
     for force in (0.0, 10.0, 10.0, 10.0, 0.0, 0.0):
         now = tracker.step(

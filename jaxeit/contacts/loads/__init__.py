@@ -6,8 +6,10 @@ from .preparation import prepare_loads
 from .proposal import Proposal, Proposed, load_proposal, shipped_proposal
 from .result import LoadKind, Loads, LoadShape
 from .settings import ForceLaw, LoadSettings
+from .sheet import AbstractGain
 
 __all__ = [
+    "AbstractGain",
     "ForceLaw",
     "LoadFitter",
     "LoadKind",

@@ -39,12 +39,12 @@ from .comparison import LAST_FALL, Comparison, Fit, improbability, padded
 from .considered import inverse_of, mean_errors, slopes_in_law
 from .fitter import LoadFitter
 from .model_error import fitted_model_error
-from .preparation import AbstractGain, prepare_loads, texture_modes
+from .preparation import prepare_loads, texture_modes
 from .pressure import FORCE
 from .programs import Problem, before
 from .result import LoadKind
 from .settings import ForceLaw, LoadSettings
-from .sheet import scaled_law
+from .sheet import AbstractGain, scaled_law
 
 # Standard deviations of the logs of amplitude, half pressure and exponent before any press. Amplitude and half pressure
 # of a layer are hardly known; with larger exponents fits of weak or long loads seldom find their end.

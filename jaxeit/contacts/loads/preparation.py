@@ -1,7 +1,6 @@
 """Preparing the fit of loads: everything that does not depend on the frame."""
 
 from functools import partial
-from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -14,28 +13,18 @@ from scipy.spatial import cKDTree
 from ..._compile import full_precision, verb
 from ...model.discretisation import Model
 from ...model.forward_model import coefficients, conductivity, transfer
+from ...model.gaussian_field import field_modes
 from ..bump_responses import mean_conductivity, points_of
 from ..preparation import sheet_and_readings
 from .fitter import LoadFitter
 from .pressure import LOAD_PARAMETERS, MAX_LOADS, Form
 from .settings import LoadSettings
-from .sheet import KnownGain, PressedSheet
+from .sheet import AbstractGain, KnownGain, PressedSheet
 from .starts import Starts
 
 # Elements that count: so many times those within so many widths of the middle of a usual load. Half of them miss most
 # of what strong and wide loads do, on whose slopes a fit then ends far from the minimum.
 REACHES, REACH = 4, 2.5
-
-
-@runtime_checkable
-class AbstractGain(Protocol):
-    """What is known of the log gain of the contact layer."""
-
-    def over(
-        self, points: Float[np.ndarray, "n 2"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n g"], Float[np.ndarray, "g g"]]:
-        """Its mean at points, its modes there, and the covariance of these under the next press."""
-        ...
 
 
 @full_precision
@@ -105,7 +94,7 @@ def _sheet(
     centroids = np.einsum("q,eqd->ed", weights, points)
     gain, about = settings.gain * field_modes(centroids, settings.gain_length), None
     if known is not None:
-        mean, gain, covariance = known.over(centroids)
+        mean, gain, covariance = known.distribution(centroids)
         about = KnownGain(put(np.exp(mean)), put(covariance))
     modes = _spread_modes(centroids, coat, settings.coat_length)
     sheet = PressedSheet(
@@ -173,27 +162,3 @@ def _atoms(sheet: PressedSheet, rows: Float[Array, "b 4"]) -> Float[Array, "b r"
 def _reach(centroids: Float[np.ndarray, "elements 2"], radius: float) -> int:
     """Largest number of elements within a circle around one of them."""
     return int(cKDTree(centroids).query_ball_point(centroids, radius, return_length=True).max())
-
-
-def field_modes(points: Float[np.ndarray, "n 2"], length: float) -> Float[np.ndarray, "n g"]:
-    """Modes of a Gaussian field of variance one at points: bumps whose sum of products is exp(-d^2 / 2 length^2)."""
-    modes = field_bumps(points, field_nodes(points.min(0), points.max(0), length), length)
-    return modes / field_norm(modes)
-
-
-def field_nodes(low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"], length: float) -> Float[np.ndarray, "g 2"]:
-    """Where the bumps of a field between two corners lie, m: on a grid whose pitch is its length."""
-    axes = [np.arange(a - length, b + 1.5 * length, length) for a, b in zip(low, high, strict=True)]
-    return np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
-
-
-def field_bumps(
-    points: Float[np.ndarray, "n 2"], nodes: Float[np.ndarray, "g 2"], length: float
-) -> Float[np.ndarray, "n g"]:
-    """Bumps at nodes, whose sum of products is proportional to exp(-d^2 / 2 length^2)."""
-    return np.asarray(np.exp(-((points[:, None] - nodes) ** 2).sum(-1) / length**2))
-
-
-def field_norm(bumps: Float[np.ndarray, "n g"]) -> float:
-    """What bumps are to be divided by for a mean variance of one."""
-    return float(np.sqrt(np.mean((bumps**2).sum(-1))))

@@ -5,6 +5,7 @@ times changes of the conductivity. These vanish away from the loads, so that the
 suffice: a slope that is off by a thousandth slows a fit down and does not move its end.
 """
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -59,6 +60,16 @@ class Unknowns(NamedTuple):
     loads: Float[Array, "r m"]
     elongation: Float[Array, "r 2"]
     law: Float[Array, "r 3"]
+
+
+class AbstractGain(eqx.Module):
+    """What is known of the log gain of the contact layer, from which a fitter is prepared."""
+
+    @abstractmethod
+    def distribution(
+        self, points: Float[np.ndarray, "n 2"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n g"], Float[np.ndarray, "g g"]]:
+        """Mean of the log gain at points (n, 2) m, its modes there, and their covariance under the next press."""
 
 
 class KnownGain(eqx.Module):

@@ -9,7 +9,7 @@ before them: a bank of Kalman filters, one for each of some variances, is weight
 to the presses (Magill 1965, IEEE Trans. Automatic Control 10, 434).
 """
 
-from typing import NamedTuple
+from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
@@ -17,9 +17,10 @@ from jaxtyping import Array, Float
 from scipy.linalg import eigh
 from scipy.special import softmax
 
-from ...contacts.loads.preparation import field_bumps, field_nodes, field_norm
 from ...contacts.loads.settings import LoadSettings
+from ...contacts.loads.sheet import AbstractGain
 from ...imaging.noise import InverseError
+from ...model.gaussian_field import field_bumps, field_nodes, field_norm
 
 # Difference within which numbers of two fields count as equal, relative to the length of the field.
 SAME = 1e-5
@@ -67,7 +68,7 @@ class GainField(eqx.Module):
     mesh_error: float
 
     @classmethod
-    def over(
+    def on_sheet(
         cls, corners: Float[np.ndarray, "2 2"], points: Float[np.ndarray, "n 2"], loads: LoadSettings, level: float
     ) -> "GainField":
         """The field of load settings over a sheet between two corners, m, of variance one at its points on average.
@@ -108,7 +109,7 @@ class GainField(eqx.Module):
             )
 
 
-class LearnedLayer(NamedTuple):
+class LearnedLayer(AbstractGain):
     """Gain of the contact layer as learned from contacts: a normal distribution of its modes for each press variance.
 
     | meaning                                                          | shape     | unit |
@@ -222,7 +223,8 @@ class LearnedLayer(NamedTuple):
         right = np.concatenate([towards.mT, (seen - self.means @ along)[..., None]], -1)
         share, surprise = np.split(np.linalg.solve(root, right), [-1], -1)
         spread = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
-        return self._replace(
+        return replace(
+            self,
             means=self.means + (share.mT @ surprise)[..., 0],
             covariances=self.covariances - share.mT @ share,
             evidence=self.evidence + _bounded(-0.5 * (surprise**2).sum((1, 2)) - spread),
@@ -235,7 +237,7 @@ class LearnedLayer(NamedTuple):
         variance = ((modes @ self.true_covariance) * modes).sum(1)
         return modes @ self.mean, np.sqrt(np.maximum(variance, 0))
 
-    def over(
+    def distribution(
         self, points: Float[np.ndarray, "n 2"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n g"], Float[np.ndarray, "g g"]]:
         """Mean of the log gain at points (n, 2) m, its modes there, and their covariance under the next press."""
@@ -250,7 +252,8 @@ class LearnedLayer(NamedTuple):
         if not 0 <= share <= 1:
             raise InverseError(f"the share that is forgotten is {share}; give 0 to 1")
         kept, prior = 1 - share, LearnedLayer.unknown(self.field)
-        return self._replace(
+        return replace(
+            self,
             means=kept * self.means,
             covariances=prior.covariances + kept**2 * (self.covariances - prior.covariances),
             evidence=prior.evidence + kept * (self.evidence - prior.evidence),
@@ -258,7 +261,7 @@ class LearnedLayer(NamedTuple):
 
     def restarted(self) -> "LearnedLayer":
         """Without the gain, where it cannot be believed; how far presses differ stays known."""
-        return LearnedLayer.unknown(self.field)._replace(contacts=self.contacts, evidence=self.evidence)
+        return replace(LearnedLayer.unknown(self.field), contacts=self.contacts, evidence=self.evidence)
 
 
 def _bounded(evidence: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
