@@ -39,7 +39,9 @@ from scipy.stats import binom, chi2, norm
 
 import jaxeit as je
 from jaxeit.contacts import LoadFitter, LoadKind, Loads, LoadShape
-from jaxeit.contacts.loads.comparison import Comparison
+from jaxeit.contacts.loads.comparison import load_shape
+from jaxeit.contacts.loads.fits import FrameFits
+from jaxeit.contacts.loads.search import FrameSearch
 
 from .clock import seconds
 from .harness import Question, Run
@@ -432,8 +434,8 @@ def _covered(ready: Prepared, given: list[Touch]) -> Iterator[Row]:
     """Whether ellipse and interval of a single load hold place and force of each touch; no other kind is fitted."""
     for number, (touch, frame) in enumerate(zip(given, ready.frames, strict=True)):
         bumps = jax.tree.map(lambda part, k=number: part[k], ready.bumps)
-        search = Comparison(ready.fitter, ready.fitter.whitened(frame, 0), bumps)
-        shape = search.shape(LoadKind.ONE, search.one())
+        fits = FrameFits(ready.fitter.belief, ready.fitter.whitened(frame, 0))
+        shape = load_shape(fits, FrameSearch(fits, ready.fitter.starts, bumps).one())
         area = float(np.linalg.det(np.asarray(shape.position_covariance[0], float)))
         yield held(shape, touch.truth[0], LOAD) | {"ellipse_mm": 1e3 * float(np.sqrt(INSIDE * np.sqrt(area)))}
 

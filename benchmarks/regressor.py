@@ -24,7 +24,7 @@ from calib.bench import TrainingFrames
 from calib.bench.scene_frames import SHARD_FRAMES
 from calib.learning.inputs import Compression, calibrated_forces, fit_compression
 from calib.learning.scenes import noise_of, scenes_for, training_bench
-from jaxeit.contacts.loads.proposal import components, standardised
+from jaxeit.contacts.loads.learned.proposal import components, standardised
 
 PIXELS = je.Pixels(20)
 WIDTH, FEATURES, MODES = 256, 64, 32  # of the hidden layers, of the last one, and ways in which skins differ

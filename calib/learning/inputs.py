@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxeit.contacts.loads.proposal import components, standardised
+from jaxeit.contacts.loads.learned.proposal import components, standardised
 
 from ..bench import TrainingFrames
 
@@ -16,7 +16,7 @@ Change = Callable[[np.ndarray], np.ndarray]
 
 
 class Compression(NamedTuple):
-    """As the fields of `jaxeit.contacts.loads.proposal.Proposal` of the same names.
+    """As the fields of `jaxeit.contacts.loads.learned.proposal.Proposal` of the same names.
 
     | meaning                                                  | shape                | unit |
     |----------------------------------------------------------|----------------------|------|

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import minimize_scalar
 
-from jaxeit.contacts import LoadKind
-from jaxeit.contacts.loads.proposal import Proposed, loads_by_kind
+from jaxeit.contacts import LoadKind, Proposed
+from jaxeit.contacts.loads.learned.proposal import loads_by_kind
 
 from .targets import Targets
 

@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from .._compile import require_known
-from ..contacts.loads.model_error import fitted_model_error
+from ..contacts.loads.learned.model_error import fitted_model_error
 from ..imaging.noise import InverseError
 from .belief.filter import Pads
 from .belief.layer import LearnedLayer
@@ -29,8 +29,8 @@ def fit_model_error(
 
     Mesh, contact layer and loads of a real skin are not those of the model. A tracker that takes the model for better
     than it is explains what the model leaves of a press by further contacts. Here one contact is fitted to each frame
-    under each of some model errors, from that of the settings on (`jaxeit.contacts.loads.model_error`). Frames for
-    which no such fit converges are left out.
+    under each of some model errors, from that of the settings on (`fitted_model_error`). Frames for which no such fit
+    converges are left out.
 
     Args:
         dv: difference frames, (n, readings) V, in each of which one contact presses, as means over holds.

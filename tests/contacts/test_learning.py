@@ -9,9 +9,11 @@ import pytest
 
 import jaxeit as je
 from jaxeit.contacts import ForceLaw, LoadKind, LoadSettings, learn_loads, prepare_loads
-from jaxeit.contacts.loads import learning
-from jaxeit.contacts.loads.comparison import Comparison, Fit
-from jaxeit.contacts.loads.model_error import LAST, STEP, fitted_model_error
+from jaxeit.contacts.loads.comparison import load_shape
+from jaxeit.contacts.loads.fits import Fit, FrameFits
+from jaxeit.contacts.loads.learned import learning
+from jaxeit.contacts.loads.learned.model_error import LAST, STEP, fitted_model_error
+from jaxeit.contacts.loads.search import FrameSearch
 from jaxeit.contacts.loads.sheet import scaled_law
 from jaxeit.imaging import InverseError
 from tests.compiled import compiled
@@ -38,14 +40,19 @@ def presses_under(law, seed=8):
 def forces_alone(model, settings, frames, **sheet):
     """Log of the force of one load that the readings of each frame tell, over the true one."""
     fitter, finder = prepare_loads(model, settings, **sheet), je.prepare_contacts(model, **sheet)
-    searches = (Comparison(fitter, fitter.whitened(frame, 0), finder(frame)) for frame in frames)
-    return np.array([search.one().loads[0, 3] for search in searches]) - np.log(FORCES)
+    return np.array([single_load(fitter, finder, frame)[1].loads[0, 3] for frame in frames]) - np.log(FORCES)
+
+
+def single_load(fitter, finder, frame):
+    """The fits to a frame, and the best one of a single load."""
+    fits = FrameFits(fitter.belief, fitter.whitened(frame, 0))
+    return fits, FrameSearch(fits, fitter.starts, finder(frame)).one()
 
 
 def test_the_law_is_learned_that_the_presses_follow(ready, monkeypatch):
     """On a mesh, a coat and a gain that the fit does not know."""
     monkeypatch.setattr(learning, "TEXTURES", (0.0,))  # a scene without protrusions
-    model = ready[0].sheet.model
+    model = ready[0].belief.sheet.model
     frames, noise, blank = presses_under(LAW)
     sheet = {"noise": noise, "sigma": je.fit_background(model, blank)}
     learned = learn_loads(model, frames, PLACES, FORCES, **sheet)
@@ -59,7 +66,7 @@ def test_the_law_is_learned_that_the_presses_follow(ready, monkeypatch):
 @pytest.mark.slow
 def test_readings_alone_then_tell_nearly_the_true_forces(ready, monkeypatch):
     monkeypatch.setattr(learning, "TEXTURES", (0.0,))
-    model = ready[0].sheet.model
+    model = ready[0].belief.sheet.model
     frames, noise, blank = presses_under(LAW)
     sheet = {"noise": noise, "sigma": je.fit_background(model, blank)}
     learned = learn_loads(model, frames, PLACES, FORCES, **sheet)
@@ -69,7 +76,7 @@ def test_readings_alone_then_tell_nearly_the_true_forces(ready, monkeypatch):
 
 @pytest.mark.slow
 def test_a_law_that_is_right_stays_and_has_no_texture(ready):
-    model = ready[0].sheet.model
+    model = ready[0].belief.sheet.model
     frames, noise, blank = presses_under((1.0, 20e3, 1.0))
     learned = learn_loads(model, frames, PLACES, FORCES, noise=noise, untouched=blank)
     assert np.abs(np.log(change(learned.law) / change(LoadSettings().law))).max() < 0.12
@@ -81,7 +88,7 @@ def test_a_law_that_is_right_stays_and_has_no_texture(ready):
 def test_a_frame_that_is_not_of_its_press_is_left_out(ready, monkeypatch):
     """One frame in seven is that of a press at the other end of the sheet."""
     monkeypatch.setattr(learning, "TEXTURES", (0.0,))
-    model = ready[0].sheet.model
+    model = ready[0].belief.sheet.model
     frames, noise, blank = presses_under(LAW)
     mixed = np.where(np.arange(len(FORCES))[:, None] == 1, frames[6], frames)
     learned = learn_loads(model, mixed, PLACES, FORCES, noise=noise, untouched=blank)
@@ -108,19 +115,18 @@ def test_forces_are_told_by_the_law_that_single_presses_follow(monkeypatch):
 def test_a_force_is_told_by_its_law_and_the_rest_of_a_load_stays(ready):
     """To first order, as a fit under that law tells it."""
     fitter, finder, frames, _ = ready
-    search = Comparison(fitter, fitter.whitened(frames[0], 0), finder(frames[0]))
-    fit, logs = search.one(), np.array([0.02, -0.01, 0.015])
+    (plainly, fit), logs = single_load(fitter, finder, frames[0]), np.array([0.02, -0.01, 0.015])
     law = replace(
-        fitter, force_logs=jnp.asarray(logs), force_covariance=0.01 * jnp.eye(3), force_variance=jnp.asarray(0.5)
+        fitter.belief, force_logs=jnp.asarray(logs), force_covariance=0.01 * jnp.eye(3), force_variance=jnp.asarray(0.5)
     )
-    told, plain = Comparison(law, search.y, None).shape(LoadKind.ONE, fit), search.shape(LoadKind.ONE, fit)
+    told, plain = load_shape(FrameFits(law, plainly.y), fit), load_shape(plainly, fit)
     np.testing.assert_array_equal(told.position, plain.position)
     np.testing.assert_array_equal(told.width, plain.width)
     np.testing.assert_allclose(told.position_covariance, plain.position_covariance, rtol=1e-12)
     assert told.covariance[3, 3] > 0.5 * plain.covariance[3, 3]
-    sheet = replace(fitter.sheet, law=scaled_law(fitter.sheet.law, logs.tolist()))
-    other = Comparison(replace(fitter, sheet=sheet), search.y, None).fit(LoadKind.ONE, fit.loads[:1, :4], 1e-6)
-    again = search.fit(LoadKind.ONE, fit.loads[:1, :4], 1e-6)
+    sheet = replace(fitter.belief.sheet, law=scaled_law(fitter.belief.sheet.law, logs.tolist()))
+    other = FrameFits(replace(fitter.belief, sheet=sheet), plainly.y).fit(LoadKind.ONE, fit.rows[:, :4], 1e-6)
+    again = plainly.fit(LoadKind.ONE, fit.rows[:, :4], 1e-6)
     change = other.loads[0, 3] - again.loads[0, 3]
     assert np.log(told.force[0] / plain.force[0]) == pytest.approx(change, rel=0.2)
     assert abs(change) > 0.01
@@ -135,7 +141,7 @@ def test_a_law_of_forces_is_three_finite_logs(wrong):
 @pytest.mark.parametrize("loads", [(SPOT,), (LONG,)], ids=["one", "edge"])
 def test_slopes_in_the_law_are_those_of_the_forward_map(ready, loads):
     """Against differences of the readings under laws that differ a little."""
-    sheet, (theta, forms) = ready[0].sheet, rows(*loads)
+    sheet, (theta, forms) = ready[0].belief.sheet, rows(*loads)
     slopes = np.asarray(compiled(sheet.unknowns, theta, forms).law)
     step, parts = 1e-4, [float(part) for part in jax.tree.leaves(sheet.law)]
     for k in range(3):
@@ -159,10 +165,10 @@ def _response(sheet, law, theta, forms):
 def test_a_texture_is_an_error_that_a_frame_does_not_tell(ready):
     """Larger textures make the place of a load less sure, and no reading another one."""
     fitter, _, _, noise = ready
-    sheet = {"noise": noise, "sigma": fitter.sheet.sigma}
-    rough = prepare_loads(fitter.sheet.model, LoadSettings(texture=0.2), **sheet)
+    sheet = {"noise": noise, "sigma": fitter.belief.sheet.sigma}
+    rough = prepare_loads(fitter.belief.sheet.model, LoadSettings(texture=0.2), **sheet)
     theta, forms = rows(SPOT)
-    plain, known = (compiled(one.sheet.unknowns, theta, forms) for one in (fitter, rough))
+    plain, known = (compiled(one.belief.sheet.unknowns, theta, forms) for one in (fitter, rough))
     np.testing.assert_allclose(known.value, plain.value, rtol=1e-12)
     added = np.asarray(known.nuisances) @ np.asarray(known.nuisances).T
     added -= np.asarray(plain.nuisances) @ np.asarray(plain.nuisances).T
@@ -172,7 +178,7 @@ def test_a_texture_is_an_error_that_a_frame_does_not_tell(ready):
 
 
 def test_presses_that_tell_no_law_are_refused(ready):
-    model, frames = ready[0].sheet.model, np.zeros((7, 550))
+    model, frames = ready[0].belief.sheet.model, np.zeros((7, 550))
     noise = ready[3]
     with pytest.raises(InverseError, match=r"dv \(3, 550\), position .* give 6 presses or more"):
         learn_loads(model, frames[:3], PLACES[:3], FORCES[:3], noise=noise)
@@ -208,7 +214,10 @@ def test_frames_of_which_no_fit_converges_tell_no_error():
 def test_a_fitter_of_a_texture_tells_one_tip_as_one(ready):
     fitter, finder, frames, noise = ready
     rough = prepare_loads(
-        fitter.sheet.model, LoadSettings(texture=0.2, model_error=0.01), noise=noise, sigma=fitter.sheet.sigma
+        fitter.belief.sheet.model,
+        LoadSettings(texture=0.2, model_error=0.01),
+        noise=noise,
+        sigma=fitter.belief.sheet.sigma,
     )
     assert rough(frames[0], finder(frames[0])).kind is LoadKind.ONE
 
@@ -216,12 +225,14 @@ def test_a_fitter_of_a_texture_tells_one_tip_as_one(ready):
 def test_presses_of_one_force_tell_no_law_of_forces(ready, monkeypatch):
     fitter, frames = ready[0], np.zeros((7, 550))
     monkeypatch.setattr(learning, "prepare_loads", lambda *_, **__: fitter)
-    monkeypatch.setattr(learning, "_fitted_law", lambda *_: (np.zeros(3), [Fit(np.zeros((3, 6)), 0.0, None, None)]))
+    monkeypatch.setattr(
+        learning, "_fitted_law", lambda *_: (np.zeros(3), [Fit(LoadKind.ONE, np.zeros((3, 6)), 0.0, None, None)])
+    )
     monkeypatch.setattr(learning, "_model_error", lambda *_: (0.01, np.zeros(7)))
     monkeypatch.setattr(learning, "_force_law", lambda *_: ForceLaw(logs=(0.1, 0.0, 0.0)))
     for most, logs in ((19.9, (0.0, 0.0, 0.0)), (20.1, (0.1, 0.0, 0.0))):
         forces = np.linspace(10.0, most, 7)
-        assert learn_loads(fitter.sheet.model, frames, PLACES, forces, noise=ready[3]).forces.logs == logs
+        assert learn_loads(fitter.belief.sheet.model, frames, PLACES, forces, noise=ready[3]).forces.logs == logs
 
 
 def test_presses_that_tell_nothing_are_not_counted(ready, monkeypatch):
@@ -232,10 +243,12 @@ def test_presses_that_tell_nothing_are_not_counted(ready, monkeypatch):
     def told(evidences):
         found = iter(evidences)
         monkeypatch.setattr(learning, "prepare_loads", lambda *_, **__: fitter)
-        monkeypatch.setattr(learning, "_fitted_law", lambda *_: (np.zeros(3), [Fit(np.zeros((3, 6)), 0.0, None, None)]))
+        monkeypatch.setattr(
+            learning, "_fitted_law", lambda *_: (np.zeros(3), [Fit(LoadKind.ONE, np.zeros((3, 6)), 0.0, None, None)])
+        )
         monkeypatch.setattr(learning, "_force_law", lambda *_: ForceLaw())
         monkeypatch.setattr(learning, "_model_error", lambda *_: (0.01, np.array([*next(found), *np.zeros(5)])))
-        return learn_loads(fitter.sheet.model, frames, PLACES, FORCES, noise=noise)
+        return learn_loads(fitter.belief.sheet.model, frames, PLACES, FORCES, noise=noise)
 
     assert told([(nothing, -10.0), (-99.0, -5.0), (nothing, -9.0)]).texture == learning.TEXTURES[1]
     assert told([(-1.0, -10.0), (nothing, -5.0)]).texture == 0  # told before, and not any longer

@@ -11,13 +11,15 @@ import pytest
 import jaxeit as je
 from calib.calibration.localisation.load_windows import LOAD_FIDELITY
 from jaxeit.contacts import AbstractGain, LoadKind, LoadSettings, prepare_loads
-from jaxeit.contacts.loads.comparison import Comparison, Fit, padded
+from jaxeit.contacts.loads.comparison import evidences, log_evidence
+from jaxeit.contacts.loads.fits import Fit, FrameFits
 from jaxeit.contacts.loads.pressure import (
     LOAD_PARAMETERS,
     MAX_LOADS,
     Form,
     elongations,
     line,
+    padded,
     pressure,
     shape_directions,
     spot,
@@ -88,7 +90,7 @@ def test_a_tip_that_is_no_gaussian_is_one(ready, touch):
     found = fitter(frame, finder(frame))
     assert found.kind is LoadKind.ONE
     assert np.linalg.norm(np.asarray(found.one.position[0]) - touch[1] @ touch[0] / touch[1].sum()) < 0.002
-    apart = eqx.tree_at(lambda f: f.least, fitter, jnp.full(2, 1e-4))
+    apart = eqx.tree_at(lambda f: f.belief.least, fitter, jnp.full(2, 1e-4))
     assert found.probability[LoadKind.ONE] > apart(frame, finder(frame)).probability[LoadKind.ONE]
 
 
@@ -116,17 +118,17 @@ def test_loads_that_saturate_the_sheet_are_told(ready, kind, touch):
 
 def test_three_loads_of_which_two_are_near_are_two(ready):
     """Of the evidence of three, that of two near one another is evidence of two, and of all three of one."""
-    fitter, finder, frames, _ = ready
-    whole = Comparison(fitter, fitter.whitened(frames[0], 0), finder(frames[0]))
+    fitter, _, frames, _ = ready
+    frame = FrameFits(fitter.belief, fitter.whitened(frames[0], 0))
     for away, kind in (((0.008, 0.07), LoadKind.TWO), ((0.008, 0.016), LoadKind.ONE)):
         places = np.array([0.06, 0.1]) + np.array([[0.0, 0.0], [away[0], 0.0], [away[1], 0.0]])
         three = np.column_stack([places, np.full(3, np.log(0.012)), np.full(3, np.log(20.0))])
-        loads, root = padded(three, LoadKind.MORE)[0], np.eye(len(whole.y))
+        loads, root = padded(three), np.eye(len(frame.y))
         curved = np.diag(np.tile([1e6, 1e6, 10.0, 10.0, 0.0, 0.0], MAX_LOADS))  # places to 1 mm
-        fits = {of: Fit(loads, 0.0, curved, root) for of in (LoadKind.ONE, LoadKind.TWO, LoadKind.MORE)}
-        alone, found = whole.evidence(LoadKind.MORE, fits[LoadKind.MORE]), whole.evidences(fits)
+        fits = {of: Fit(of, loads, 0.0, curved, root) for of in (LoadKind.ONE, LoadKind.TWO, LoadKind.MORE)}
+        alone, found = log_evidence(frame.belief, fits[LoadKind.MORE]), evidences(frame, fits)
         assert found[LoadKind.MORE] < alone - 10
-        own = whole.evidences({of: fit for of, fit in fits.items() if of is not LoadKind.MORE})
+        own = evidences(frame, {of: fit for of, fit in fits.items() if of is not LoadKind.MORE})
         assert found[kind] == pytest.approx(np.logaddexp(own[kind], alone), abs=1e-3)
 
 
@@ -206,7 +208,7 @@ def test_slopes_are_those_of_the_forward_map(ready, loads, most):
 
     A strong load saturates its middle, which then tells nothing of it, and takes elements from a weaker one.
     """
-    sheet = ready[0].sheet
+    sheet = ready[0].belief.sheet
     theta, forms = rows(*loads)
     by_jax = jax.jacfwd(lambda flat: sheet.response(flat, forms))(theta).reshape(-1, MAX_LOADS * LOAD_PARAMETERS)
     known = compiled(sheet.unknowns, theta, forms)
@@ -222,8 +224,8 @@ def test_slopes_are_those_of_the_forward_map(ready, loads, most):
 def test_what_is_not_known_of_the_coat_moves_the_readings_of_a_load(ready):
     """Slopes in the coat against differences of frames with and without the load."""
     fitter, _, _, noise = ready
-    model = fitter.sheet.model
-    sheet = prepare_loads(model, noise=noise).sheet
+    model = fitter.belief.sheet.model
+    sheet = prepare_loads(model, noise=noise).belief.sheet
     theta, forms = rows(SPOT)
     white = jax.jit(lambda sigma: sheet.white(transfer(model, coefficients(model, sigma))))
     factor = sheet._pressed(theta, forms) / sheet.sigma
@@ -249,10 +251,12 @@ class Gain(AbstractGain):
 def test_a_gain_of_which_nothing_is_known_changes_nothing(ready):
     """The errors of the readings by the modes of the gain, and the readings."""
     fitter, _, _, noise = ready
-    model, sigma = fitter.sheet.model, fitter.sheet.sigma
-    same = prepare_loads(model, noise=noise, sigma=sigma, gain=Gain(lambda points: np.zeros(len(points)), 1.0)).sheet
+    model, sigma = fitter.belief.sheet.model, fitter.belief.sheet.sigma
+    same = prepare_loads(
+        model, noise=noise, sigma=sigma, gain=Gain(lambda points: np.zeros(len(points)), 1.0)
+    ).belief.sheet
     theta, forms = rows(SPOT)
-    one, other = (compiled(sheet.unknowns, theta, forms) for sheet in (fitter.sheet, same))
+    one, other = (compiled(sheet.unknowns, theta, forms) for sheet in (fitter.belief.sheet, same))
     np.testing.assert_allclose(other.value, one.value, atol=1e-9 * float(jnp.abs(one.value).max()))
     errors = [np.asarray(each.nuisances @ each.nuisances.T) for each in (one, other)]
     np.testing.assert_allclose(errors[1], errors[0], atol=1e-9 * np.abs(errors[0]).max())
@@ -261,12 +265,12 @@ def test_a_gain_of_which_nothing_is_known_changes_nothing(ready):
 def test_a_gain_that_is_even_and_known_is_a_factor_of_the_force(ready):
     """The law sees pressure times gain: half the force under twice the gain shows the same, and so do its slopes."""
     fitter, _, _, noise = ready
-    model, sigma = fitter.sheet.model, fitter.sheet.sigma
+    model, sigma = fitter.belief.sheet.model, fitter.belief.sheet.sigma
     even = Gain(lambda points: np.full(len(points), np.log(2.0)), 1.0)
-    twice = prepare_loads(model, noise=noise, sigma=sigma, gain=even).sheet
+    twice = prepare_loads(model, noise=noise, sigma=sigma, gain=even).belief.sheet
     one, other = (
         compiled(sheet.unknowns, *rows(SPOT.at[3].add(log)))
-        for sheet, log in ((fitter.sheet, 0.0), (twice, -np.log(2.0)))
+        for sheet, log in ((fitter.belief.sheet, 0.0), (twice, -np.log(2.0)))
     )
     for name in ("value", "loads", "shapes"):
         expected = np.asarray(getattr(one, name))
@@ -280,7 +284,7 @@ def test_a_gain_that_is_known_places_loads_where_they_are(ready):
     # With the noise of `ready` the corner is 0.7995 or 0.8005 mm off, as processors round.
     frames, _, _ = frames_of([touch for _, touch in TOUCHES.values()], seed=1)
     known = Gain(lambda points: float(GAIN.std) * np.asarray(GAIN._field(jnp.asarray(points))), 0.1)
-    wiser = prepare_loads(fitter.sheet.model, noise=noise, sigma=fitter.sheet.sigma, gain=known)
+    wiser = prepare_loads(fitter.belief.sheet.model, noise=noise, sigma=fitter.belief.sheet.sigma, gain=known)
     away = []
     for frame, (kind, (places, forces)) in zip(frames, TOUCHES.values(), strict=True):
         if kind in (LoadKind.ONE, LoadKind.TWO):
@@ -308,9 +312,9 @@ def test_what_cannot_be_fitted_is_refused(ready):
     with pytest.raises(InverseError, match="fit one frame of 550 readings at a time"):
         fitter(frames[:2], contacts)
     with pytest.raises(InverseError, match="both tell the sheet"):
-        prepare_loads(fitter.sheet.model, noise=noise, untouched=np.ones(550), sigma=fitter.sheet.sigma)
+        prepare_loads(fitter.belief.sheet.model, noise=noise, untouched=np.ones(550), sigma=fitter.belief.sheet.sigma)
     with pytest.raises(InverseError, match="give the 550 readings of one frame"):
-        je.prepare_contacts(fitter.sheet.model, noise=noise, untouched=np.ones(5))
+        je.prepare_contacts(fitter.belief.sheet.model, noise=noise, untouched=np.ones(5))
     with pytest.raises(InverseError, match="reading 3 is not finite"):
         fitter(np.where(np.arange(550) == 3, np.nan, frames[0]), contacts)
     for bad in (

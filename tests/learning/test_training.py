@@ -20,7 +20,7 @@ from calib.learning.quality import fit_temperature
 from calib.learning.scenes import SCENES, training_bench
 from calib.learning.targets import targets_of
 from jaxeit.contacts import LoadKind, load_proposal
-from jaxeit.contacts.loads.proposal import PARAMETERS
+from jaxeit.contacts.loads.learned.proposal import PARAMETERS
 
 from ..helpers import skin_of
 

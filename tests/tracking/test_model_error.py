@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from jaxeit.contacts.loads.model_error import STEP
+from jaxeit.contacts.loads.learned.model_error import STEP
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import fit_model_error, model_error, press_evidence
 from jaxeit.tracking.belief.filter import CONTACT_SIZE

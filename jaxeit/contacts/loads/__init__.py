@@ -1,10 +1,10 @@
 """What touches the skin in one frame: loads fitted through the pressure law."""
 
 from .fitter import LoadFitter
-from .learning import learn_loads
+from .learned.learning import learn_loads
+from .learned.proposal import Proposal, load_proposal, shipped_proposal
 from .preparation import prepare_loads
-from .proposal import Proposal, Proposed, load_proposal, shipped_proposal
-from .result import LoadKind, Loads, LoadShape
+from .result import LoadKind, Loads, LoadShape, Proposed
 from .settings import ForceLaw, LoadSettings
 from .sheet import AbstractGain
 

@@ -16,6 +16,7 @@ from ...model.forward_model import coefficients, conductivity, transfer
 from ...model.gaussian_field import field_modes
 from ..bump_responses import mean_conductivity, points_of
 from ..preparation import sheet_and_readings
+from .belief import LoadBelief
 from .fitter import LoadFitter
 from .pressure import LOAD_PARAMETERS, MAX_LOADS, Form
 from .settings import LoadSettings
@@ -59,17 +60,25 @@ def prepare_loads(
     low, high = chart.min(0), chart.max(0)
     sheet = _sheet(model, settings, sigma, settings.coat_spread(known), put(found.factor), found.electrodes, gain)
     return LoadFitter(
-        sheet=sheet,
+        belief=_belief(sheet, settings, low, high),
         whitening=found.whitening,
         compress=put(found.compress),
         starts=_starts(sheet, settings, low, high, mean_conductivity(model, np.asarray(sigma, float))),
+    )
+
+
+def _belief(sheet: PressedSheet, settings: LoadSettings, low: np.ndarray, high: np.ndarray) -> LoadBelief:
+    """What settings say of loads on a sheet between two corners."""
+    put = partial(jnp.asarray, dtype=sheet.sigma.dtype)
+    return LoadBelief(
+        sheet=sheet,
         low=put(low),
         high=put(high),
         usual=put(np.log([settings.width, settings.force])),
         spread=put([settings.width_spread, settings.force_spread]),
         difference=put([settings.width_difference, settings.force_difference]),
-        length=put(settings.length),
         least=put([settings.nearest, settings.shortest]),
+        length=put(settings.length),
         prior=put(settings.prior),
         model_error=put(settings.model_error),
         shapes=put(settings.shapes),

@@ -1,8 +1,8 @@
-"""Pressure of up to `MAX_LOADS` loads.
+"""Kinds of loads in one table of parameters, and the pressure of loads.
 
 Each load has six parameters: x, y, log width s, log force, and half its length along x and along y. A round load has no
 length. One table of parameters for all kinds of loads means one compiled program for all of them; which rows count,
-and how, is an array of `Form`.
+and how, is an array of `Form`. What kinds there are, and of which forms, is in `FORMS` alone.
 """
 
 import math
@@ -15,12 +15,7 @@ import numpy as np
 from jax.scipy.special import erf
 from jaxtyping import Array, Bool, Float, Int
 
-MAX_LOADS, LOAD_PARAMETERS = 3, 6  # loads, and parameters of each
-FORCE = 3  # of these the log of the force
-ROW = (-0.8, 0.0, 0.8)  # of the half length, places of the round loads that an edge is a row of
-LOG_ROW = np.array([0, 0, 0, np.log(len(ROW)), 0, 0])  # by which each of them is weaker
-SQRT_2, SQRT_3 = math.sqrt(2), math.sqrt(3)
-ELONGATION = 0.3  # standard deviation of second moments over that of the others
+from .result import LoadKind
 
 
 class Form(IntEnum):
@@ -30,9 +25,46 @@ class Form(IntEnum):
     ROUND = 1
     LONG = 2
 
+    @property
+    def parameters(self) -> int:
+        """Number of parameters of such a row that count, which are the first ones."""
+        return (0, 4, 6)[self]
+
+
+# Forms of the loads of each kind; a proposal's network tells the kinds in this order.
+FORMS = {
+    LoadKind.ONE: (Form.ROUND,),
+    LoadKind.TWO: (Form.ROUND, Form.ROUND),
+    LoadKind.EDGE: (Form.LONG,),
+    LoadKind.MORE: (Form.ROUND, Form.ROUND, Form.ROUND),
+}
+MAX_LOADS, LOAD_PARAMETERS = max(map(len, FORMS.values())), max(form.parameters for form in Form)  # of each load
+FORCE = 3  # of these the log of the force
+ROW = (-0.8, 0.0, 0.8)  # of the half length, places of the round loads that an edge is a row of
+LOG_ROW = np.array([0, 0, 0, np.log(len(ROW)), 0, 0])  # by which each of them is weaker
+SQRT_2, SQRT_3 = math.sqrt(2), math.sqrt(3)
+ELONGATION = 0.3  # standard deviation of second moments over that of the others
 
 Parameters = Float[Array, "n 6"]
 Forms = Int[Array, " n"]
+
+
+def padded(rows: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "n 6"]:
+    """All rows of parameters; those that loads do not have repeat the last one."""
+    rows = np.pad(rows, ((0, 0), (0, LOAD_PARAMETERS - rows.shape[1])))
+    return np.concatenate([rows, np.repeat(rows[-1:], MAX_LOADS - len(rows), 0)])
+
+
+def padded_forms(kind: LoadKind) -> Int[np.ndarray, " n"]:
+    """Forms of all rows of a kind of loads."""
+    forms = FORMS[kind]
+    return np.array(forms + (Form.ABSENT,) * (MAX_LOADS - len(forms)), np.int32)
+
+
+def free_parameters(forms: Int[np.ndarray, " n"]) -> Bool[np.ndarray, "n 6"]:
+    """Which parameters of all rows are fitted."""
+    free: np.ndarray = np.arange(LOAD_PARAMETERS) < np.array([form.parameters for form in Form])[forms][:, None]
+    return free
 
 
 def pressure(loads: Parameters, forms: Forms, points: Float[Array, "... 2"]) -> Float[Array, "..."]:

@@ -1,6 +1,7 @@
-"""Loads as they are handed out."""
+"""Loads as they are handed out, and as they are proposed."""
 
 from enum import IntEnum
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -87,3 +88,40 @@ class Loads(eqx.Module):
     def of(self, kind: LoadKind) -> LoadShape | None:
         """The best loads of a kind."""
         return None if kind is LoadKind.NONE else getattr(self, kind.name.lower())
+
+
+class Proposed(NamedTuple):
+    """What a `Proposal` says of a frame, or of some along leading axes.
+
+    | meaning                                                                        | shape       | unit   |
+    |--------------------------------------------------------------------------------|-------------|--------|
+    | probability of each kind, in the order of `LoadKind`                           | (..., 5)    | 1      |
+    | one, two, more: x, y, log width and log force of each load                     | (..., n, 4) | m, N   |
+    | edge: those of its middle, and from there to its end                           | (..., 1, 6) | m, N   |
+    | distance from the training scenes; beyond 1 lies one in 500 of their own frames | (...)       | 1      |
+
+    The distance is infinite, and all kinds are equally probable, for a frame with fewer readings than three loads have
+    parameters and for one whose signal is larger than any of a real skin.
+    """
+
+    probability: Float[np.ndarray, "*n 5"]
+    one: Float[np.ndarray, "*n 1 4"]
+    two: Float[np.ndarray, "*n 2 4"]
+    edge: Float[np.ndarray, "*n 1 6"]
+    more: Float[np.ndarray, "*n 3 4"]
+    distance: Float[np.ndarray, "*n"]
+
+    @property
+    def kind(self) -> LoadKind:
+        """The most probable kind of one frame."""
+        return LoadKind(int(np.argmax(self.probability)))
+
+    @property
+    def outside(self) -> bool:
+        """Whether a frame is unlike those of the training, so that nothing of the proposal can be relied on."""
+        return bool(np.any(self.distance > 1))
+
+    def of(self, kind: LoadKind) -> np.ndarray:
+        """Loads of a kind, as a fit begins with them."""
+        found: np.ndarray = getattr(self, kind.name.lower())
+        return found

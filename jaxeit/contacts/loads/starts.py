@@ -1,7 +1,5 @@
 """Where fits of loads begin."""
 
-from typing import TYPE_CHECKING
-
 import equinox as eqx
 import jax
 import numpy as np
@@ -12,9 +10,6 @@ from scipy.special import logsumexp
 from ...effects.material import ContactPiezoresistance
 from ..result import Contacts
 from ..starts import MIN_INDEPENDENT_FRACTION
-
-if TYPE_CHECKING:
-    from .comparison import Fit
 
 MIN_REACH, MAX_REACH = 0.5, 1.6  # of the halves of a split load from its middle, in its widths
 
@@ -68,11 +63,13 @@ class Starts(eqx.Module):
         half = np.sqrt(3 * share[0] * share[1]) * (two[1, :2] - two[0, :2])
         return float(share.min()), np.concatenate([share @ two[:, :3], [logsumexp(two[:, 3])], half])[None]
 
-    def another(self, two: "Fit", left: np.ndarray, slopes: np.ndarray) -> tuple[float, np.ndarray]:
+    def another(
+        self, two: np.ndarray, root: np.ndarray, left: np.ndarray, slopes: np.ndarray
+    ) -> tuple[float, np.ndarray]:
         """Two loads and the atom that explains most of what they leave, (3, 4); and by how much chi-square falls with
         it, where the two give way along their slopes (r, m)."""
-        fall, atom = self.atom(left, two.root, slopes)
-        return fall, np.concatenate([two.loads[:2, :4], atom])
+        fall, atom = self.atom(left, root, slopes)
+        return fall, np.concatenate([two[:, :4], atom])
 
     def atom(self, left: np.ndarray, root: np.ndarray, slopes: np.ndarray | None = None) -> tuple[float, np.ndarray]:
         """The atom that explains most of what is left in units of errors: fall of chi-square, and the load (1, 4).

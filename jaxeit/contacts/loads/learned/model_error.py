@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ...imaging.noise import InverseError
+from ....imaging.noise import InverseError
 
 # Model errors that are tried: each is larger than the one before by this factor, from the first at least to the last.
 STEP, FIRST, LAST = 2**0.5, 1e-3, 0.15

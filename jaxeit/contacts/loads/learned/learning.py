@@ -32,19 +32,19 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 from scipy.linalg import solve_triangular
 
-from ..._compile import require_known
-from ...imaging.noise import InverseError
-from ...model.discretisation import Model
-from .comparison import LAST_FALL, Comparison, Fit, improbability, padded
-from .considered import inverse_of, mean_errors, slopes_in_law
-from .fitter import LoadFitter
+from ...._compile import require_known
+from ....imaging.noise import InverseError
+from ....model.discretisation import Model
+from ..belief import LoadBelief
+from ..comparison import log_evidence
+from ..considered import inverse_of, mean_errors, slopes_in_law
+from ..fits import LAST_FALL, Fit, FrameFits
+from ..preparation import prepare_loads, texture_modes
+from ..pressure import FORCE
+from ..result import LoadKind
+from ..settings import ForceLaw, LoadSettings
+from ..sheet import AbstractGain, scaled_law
 from .model_error import fitted_model_error
-from .preparation import prepare_loads, texture_modes
-from .pressure import FORCE
-from .programs import Problem, before
-from .result import LoadKind
-from .settings import ForceLaw, LoadSettings
-from .sheet import AbstractGain, scaled_law
 
 # Standard deviations of the logs of amplitude, half pressure and exponent before any press. Amplitude and half pressure
 # of a layer are hardly known; with larger exponents fits of weak or long loads seldom find their end.
@@ -118,7 +118,7 @@ def learn_loads(
     _require_presses(frames, places, forces)
     usual = replace(settings or LoadSettings(), forces=ForceLaw())
     fitter = prepare_loads(model, usual, noise=noise, untouched=untouched, sigma=sigma, channels=channels, gain=gain)
-    presses = _Presses(fitter, np.stack([fitter.whitened(frame, 0) for frame in frames]), np.log(forces))
+    presses = _Presses(fitter.belief, np.stack([fitter.whitened(frame, 0) for frame in frames]), np.log(forces))
     learned, final, best, logs, counted = usual, presses, -np.inf, np.zeros(3), np.ones(len(forces), bool)
     starts = list(np.column_stack([places, np.full(len(forces), np.log(usual.width)), np.log(forces)])[:, None])
     for texture in TEXTURES:
@@ -131,8 +131,8 @@ def learn_loads(
             counted = np.isfinite(evidences)  # a press that no load explains tells nothing under any texture
         if not (evidence := float(evidences[counted].sum())) > best:
             break
-        learned, best = replace(tried, law=under.fitter.sheet.law, model_error=error), evidence
-        starts, final = [fit.loads[:1, :4] for fit in fits], under.with_error(error)
+        learned, best = replace(tried, law=under.belief.sheet.law, model_error=error), evidence
+        starts, final = [fit.rows[:, :4] for fit in fits], under.with_error(error)
     if np.ptp(np.log(forces[counted])) < FORCES_APART:
         return learned
     return replace(learned, forces=_force_law(final, starts, counted))
@@ -155,7 +155,7 @@ def _require_presses(frames: np.ndarray, places: np.ndarray, forces: np.ndarray)
 
 
 class _Presses(NamedTuple):
-    """Single presses, and the fitter of a law under which they are fitted.
+    """Single presses, and what is believed of loads when they are fitted.
 
     | meaning                            | shape  |
     |------------------------------------|--------|
@@ -163,47 +163,44 @@ class _Presses(NamedTuple):
     | log_force: logs of their forces, N | (n,)   |
     """
 
-    fitter: LoadFitter
+    belief: LoadBelief
     y: np.ndarray
     log_force: np.ndarray
 
     def under(self, logs: np.ndarray) -> "_Presses":
-        """The presses, where amplitude, half pressure and exponent of the law are those of now times exp of these.
-
-        Where fits of frames begin is not prepared anew: presses begin where they are.
-        """
-        return self._with_sheet(law=scaled_law(self.fitter.sheet.law, logs.tolist()))
+        """The presses, where amplitude, half pressure and exponent of the law are those of now times exp of these."""
+        return self._with_sheet(law=scaled_law(self.belief.sheet.law, logs.tolist()))
 
     def with_texture(self, settings: LoadSettings) -> "_Presses":
         """The presses on a sheet whose gain has the texture of these settings."""
-        sheet = self.fitter.sheet
+        sheet = self.belief.sheet
         return self._with_sheet(texture=texture_modes(sheet.points, sheet.weights, settings, sheet.gain.dtype))
 
     def with_error(self, error: float) -> "_Presses":
         """The presses under another model error."""
-        found = jnp.asarray(error, self.fitter.model_error.dtype)
-        return self._replace(fitter=replace(self.fitter, model_error=found))
+        found = jnp.asarray(error, self.belief.model_error.dtype)
+        return self._replace(belief=replace(self.belief, model_error=found))
 
     def _with_sheet(self, **parts: Any) -> "_Presses":
-        return self._replace(fitter=replace(self.fitter, sheet=replace(self.fitter.sheet, **parts)))
+        return self._replace(belief=replace(self.belief, sheet=replace(self.belief.sheet, **parts)))
 
-    def search(self, k: int) -> Comparison:
+    def frame(self, k: int) -> FrameFits:
         """The fits of one press, whose force is known."""
-        usual, spread = self.fitter.usual.at[1].set(self.log_force[k]), self.fitter.spread.at[1].set(FORCE_ERROR)
-        return Comparison(replace(self.fitter, usual=usual, spread=spread), self.y[k], None)
+        usual, spread = self.belief.usual.at[1].set(self.log_force[k]), self.belief.spread.at[1].set(FORCE_ERROR)
+        return FrameFits(replace(self.belief, usual=usual, spread=spread), self.y[k])
 
     def fits(self, starts: list[np.ndarray]) -> list[Fit]:
         """One load for each press, from where it begins, (1, 4)."""
-        return [self.search(k).fit(LoadKind.ONE, start, LAST_FALL) for k, start in enumerate(starts)]
+        return [self.frame(k).fit(LoadKind.ONE, start, LAST_FALL) for k, start in enumerate(starts)]
 
     def missed(self, k: int, start: np.ndarray) -> tuple[float, float, np.ndarray]:
         """Log of the force of one press that its readings tell, over the true one; its variance, its slopes (3,)."""
-        search = Comparison(self.fitter, self.y[k], None)
-        fit = search.fit(LoadKind.ONE, start, LAST_FALL)
-        free, known = search.free(LoadKind.ONE, fit), search.known(LoadKind.ONE, fit)
-        square = mean_errors(known, free, np.asarray(self.fitter.shapes, float))[1]
+        frame = FrameFits(self.belief, self.y[k])
+        fit = frame.fit(LoadKind.ONE, start, LAST_FALL)
+        known = frame.known(fit)
+        square = mean_errors(known, fit.free, np.asarray(self.belief.shapes, float))[1]
         missed = float(fit.loads[0, FORCE] - self.log_force[k])
-        return missed, float(square[FORCE, FORCE]), slopes_in_law(known, free)[FORCE]
+        return missed, float(square[FORCE, FORCE]), slopes_in_law(known, fit.free)[FORCE]
 
     def normal(self, fits: list[Fit], kept: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Normal matrix (3, 3) and gradient (3,) of some presses in the logs of the law, in which loads give way."""
@@ -216,14 +213,12 @@ class _Presses(NamedTuple):
     def _of_law(self, k: int, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
         """Slopes of a press in the logs of the law, and what is left of it, in standard deviations, without what its
         load explains."""
-        search = self.search(k)
-        left, known = search.left(LoadKind.ONE, fit)
-        free = search.free(LoadKind.ONE, fit)
-        y, loads, root, forms = search.put(search.y, fit.loads, fit.root, padded(fit.loads[:1], LoadKind.ONE)[1])
-        unusual, by_loads = map(np.asarray, before(Problem(search.fitter, y, forms, root), loads))
-        slopes = np.concatenate([known.law, np.asarray(known.loads)[:, free]], 1)
+        frame = self.frame(k)
+        left, known = frame.left(fit)
+        unusual, by_loads = frame.surprise(fit)
+        slopes = np.concatenate([known.law, np.asarray(known.loads)[:, fit.free]], 1)
         slopes = solve_triangular(fit.root, slopes, lower=True)
-        along = np.linalg.qr(np.concatenate([slopes[:, 3:], by_loads[:, free]]))[0]
+        along = np.linalg.qr(np.concatenate([slopes[:, 3:], by_loads]))[0]
         whole = np.column_stack([np.pad(slopes[:, :3], ((0, len(unusual)), (0, 0))), np.append(left, -unusual)])
         rest = whole - along @ (along.T @ whole)
         return rest[:, :3], rest[:, 3]
@@ -233,7 +228,7 @@ def _fitted_law(presses: _Presses, logs: np.ndarray, starts: list[np.ndarray]) -
     """Logs (3,) by which the law changes under which the presses are least surprising, and their loads."""
 
     def surprise(fits: list[Fit], logs: np.ndarray, kept: list[int]) -> float:
-        return sum(improbability(fits[k]) for k in kept) + float(np.sum((logs / SPREAD) ** 2))
+        return sum(fits[k].improbability for k in kept) + float(np.sum((logs / SPREAD) ** 2))
 
     fits = presses.under(logs).fits(starts)
     for _ in range(STEPS):
@@ -242,7 +237,7 @@ def _fitted_law(presses: _Presses, logs: np.ndarray, starts: list[np.ndarray]) -
         matrix, towards = presses.under(logs).normal(fits, kept)
         step = np.linalg.solve(matrix + np.diag(SPREAD**-2.0), towards - logs / SPREAD**2)
         step *= min(1, MOST_STEP / max(np.abs(step).max(), LEAST_STEP))
-        now, begin = surprise(fits, logs, kept), [fit.loads[:1, :4] for fit in fits]
+        now, begin = surprise(fits, logs, kept), [fit.rows[:, :4] for fit in fits]
         for _ in range(1 + HALVINGS):
             found = presses.under(logs + step).fits(begin)
             if surprise(found, logs + step, kept) < now:
@@ -287,9 +282,9 @@ def _model_error(presses: _Presses, fits: list[Fit]) -> tuple[float, np.ndarray]
     """The model error of single presses, of unknown force, and the log of the probability of each under it, (n,)."""
 
     def evidence(own: np.ndarray, fit: Fit, error: float) -> float:
-        search = Comparison(presses.with_error(error).fitter, own, None)
-        return search.evidence(LoadKind.ONE, search.fit(LoadKind.ONE, fit.loads[:1, :4], LAST_FALL))
+        frame = FrameFits(presses.with_error(error).belief, own)
+        return log_evidence(frame.belief, frame.fit(LoadKind.ONE, fit.rows[:, :4], LAST_FALL))
 
     each = [cache(partial(evidence, *one)) for one in zip(presses.y, fits, strict=True)]
-    error = fitted_model_error(each, float(presses.fitter.model_error), SURELY)
+    error = fitted_model_error(each, float(presses.belief.model_error), SURELY)
     return error, np.array([one(error) for one in each])

@@ -11,20 +11,21 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
-from ...array_files import read_arrays, write_arrays
-from ...imaging.noise import InverseError
-from ...skin import Skin, skin_hash
-from .result import LoadKind
+from ....array_files import read_arrays, write_arrays
+from ....imaging.noise import InverseError
+from ....skin import Skin, skin_hash
+from ..pressure import FORMS
+from ..result import LoadKind, Proposed
 
 FORMAT = "jaxeit proposal 1"
-# Rows and parameters of the loads of each kind, as `LoadFitter` fits them, in the order of the network's outputs.
-SHAPES = {LoadKind.ONE: (1, 4), LoadKind.TWO: (2, 4), LoadKind.EDGE: (1, 6), LoadKind.MORE: (3, 4)}
+# Rows and parameters of the loads of each kind, in the order of the network's outputs.
+SHAPES = {kind: (len(forms), max(form.parameters for form in forms)) for kind, forms in FORMS.items()}
 PARAMETERS = sum(rows * size for rows, size in SHAPES.values())
 KINDS = len(LoadKind)
 LAYERS = 3
@@ -44,43 +45,6 @@ def loads_by_kind(values: Any) -> dict[LoadKind, Any]:
         kind: values[..., end - rows * size : end].reshape(-1, rows, size)
         for end, (kind, (rows, size)) in zip(ends.tolist(), SHAPES.items(), strict=True)
     }
-
-
-class Proposed(NamedTuple):
-    """What a `Proposal` says of a frame, or of some along leading axes.
-
-    | meaning                                                                        | shape       | unit   |
-    |--------------------------------------------------------------------------------|-------------|--------|
-    | probability of each kind, in the order of `LoadKind`                           | (..., 5)    | 1      |
-    | one, two, more: x, y, log width and log force of each load                     | (..., n, 4) | m, N   |
-    | edge: those of its middle, and from there to its end                           | (..., 1, 6) | m, N   |
-    | distance from the training scenes; beyond 1 lies one in 500 of their own frames | (...)       | 1      |
-
-    The distance is infinite, and all kinds are equally probable, for a frame with fewer readings than `MIN_READINGS`
-    and for one whose signal is larger than any of a real skin.
-    """
-
-    probability: Float[np.ndarray, "*n 5"]
-    one: Float[np.ndarray, "*n 1 4"]
-    two: Float[np.ndarray, "*n 2 4"]
-    edge: Float[np.ndarray, "*n 1 6"]
-    more: Float[np.ndarray, "*n 3 4"]
-    distance: Float[np.ndarray, "*n"]
-
-    @property
-    def kind(self) -> LoadKind:
-        """The most probable kind of one frame."""
-        return LoadKind(int(np.argmax(self.probability)))
-
-    @property
-    def outside(self) -> bool:
-        """Whether a frame is unlike those of the training, so that nothing of the proposal can be relied on."""
-        return bool(np.any(self.distance > 1))
-
-    def of(self, kind: LoadKind) -> np.ndarray:
-        """Loads of a kind, as a fit begins with them."""
-        found: np.ndarray = getattr(self, kind.name.lower())
-        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +186,7 @@ class Proposal:
 NUMBERS = tuple(each.name for each in fields(Proposal) if each.name != "about")
 
 
-PROPOSALS = Path(__file__).parent / "proposals"
+PROPOSALS = Path(__file__).parents[1] / "proposals"
 
 
 def shipped_proposal(skin: Skin) -> Proposal | None:
