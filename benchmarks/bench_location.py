@@ -18,7 +18,7 @@ import numpy as np
 
 import calib
 from calib.bench import Bench, load_bench, simulate
-from calib.calibration.evaluation import THIRDS, Evaluation
+from calib.calibration.evaluation import FORCE_THIRDS, Evaluation
 from calib.fitting.validation import rmse
 from jaxeit import effects as fx
 
@@ -89,7 +89,7 @@ def judged(key: tuple[str, str], same: list[Row]) -> Row:
     each = [one.summary() for one in seen]
     told, true = (np.concatenate([getattr(one, name) for one in seen]) for name in ("total_force", "force"))
     width = np.concatenate([one.half_width for one in seen])
-    thirds = {name: [one[f"coverage_{name}"] for one in each] for name in THIRDS}
+    thirds = {name: [one[f"coverage_{name}"] for one in each] for name in FORCE_THIRDS}
     return {
         "layout": key[0],
         "location": key[1],

@@ -27,9 +27,9 @@ from scipy.stats import norm
 import calib
 import jaxeit as je
 from calib.calibration import Calibration, KnownForces, OrdinaryUse, learn_layer
-from calib.calibration.application import FORMAT, TRACKS
+from calib.calibration.application import FORCE_MAP_FORMAT, TRACKS
 from calib.calibration.evaluation import Evaluation
-from calib.calibration.localisation.contact_tracks import ABOUT
+from calib.calibration.localisation.contact_tracks import TRACK_ARRAYS
 from calib.calibration.localisation.ellipses import INSIDE_90
 from calib.fitting.validation import rmse
 from calib.session import Session, open_archive
@@ -194,8 +194,8 @@ def _followed(calibration: Calibration, session: Session) -> Row:
     """How contacts were followed in the holds of single presses; the force is that of the contact that is nearest."""
     with tempfile.TemporaryDirectory() as folder:
         path = calib.apply(calibration, session, Path(folder) / "maps.h5", track=True)
-        with open_archive(path, FORMAT) as file:
-            found = {name: file.arrays[TRACKS + name].read() for name in ABOUT}
+        with open_archive(path, FORCE_MAP_FORMAT) as file:
+            found = {name: file.arrays[TRACKS + name].read() for name in TRACK_ARRAYS}
     presses, held = session.presses, []
     for begin, end, *truth in zip(
         presses.t_hold0, presses.t_hold1, presses.x, presses.y, presses.target_force, strict=True

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..bench import BenchError, open_training_frames
-from ..bench.frame_shards import EXTRA, SHARDS, Shard, by_frame
+from ..bench.frame_shards import SHARDS, TABLES_EXTRA, Shard, by_frame
 from ..bench.training_frames import TrainingFrames, claim_folder
 from ..session.importers.child import library
 
@@ -59,7 +59,7 @@ def export_training_frames(
         # for pandas, Polars, DuckDB and Hugging Face datasets
         print(calib.export_training_frames("frames", "parquet"))
     """
-    library("pyarrow.parquet", EXTRA)
+    library("pyarrow.parquet", TABLES_EXTRA)
     frames, output = open_training_frames(folder), Path(output)
     if output.resolve() == Path(folder).resolve():
         raise BenchError(f"{output}: holds the frames themselves; give another folder")

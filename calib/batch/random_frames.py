@@ -20,9 +20,9 @@ import numpy as np
 from jaxeit.kinds import require_kind
 
 from ..bench import BenchError, FrameSet
-from ..bench.frame_shards import EXTRA, SHARDS, Shard
+from ..bench.frame_shards import SHARDS, TABLES_EXTRA, Shard
 from ..bench.scene_frames import SceneFrames
-from ..bench.training_frames import VERSION, card_of, claim_folder
+from ..bench.training_frames import FRAMES_VERSION, card_of, claim_folder
 from ..runtime import settings, take_over
 from ..session import file_hash, replacing
 from ..session.importers.child import library
@@ -109,7 +109,7 @@ def write_training_frames(
         raise BenchError(f"{jobs} jobs; give one or more")
     folder, versions = Path(folder), _versions(frame_set.file_format)
     # A folder may get more frames, so that the number of frames is no part of the mark.
-    mark = digest(describe(replace(frame_set, frames=1)), str(VERSION), *versions.values())
+    mark = digest(describe(replace(frame_set, frames=1)), str(FRAMES_VERSION), *versions.values())
     claim_folder(folder, card_of(frame_set, mark, versions))
     files, rows = SHARDS[frame_set.file_format], frame_set.rows
     left = [n for n in range(frame_set.shards) if not files.is_whole(files.path(folder, n), mark, rows(n))]
@@ -123,7 +123,7 @@ def write_training_frames(
 def _versions(file_format: str) -> dict[str, str]:
     """Versions of the libraries that the bytes of a shard depend on."""
     found = {"jaxeit": metadata.version("jaxeit"), "jax": jax.__version__, "numpy": np.__version__}
-    return found | ({"pyarrow": library("pyarrow", EXTRA).__version__} if file_format == "parquet" else {})
+    return found | ({"pyarrow": library("pyarrow", TABLES_EXTRA).__version__} if file_format == "parquet" else {})
 
 
 def _tasks(folder: Path, made: FrameSet, mark: str, numbers: Iterable[int]) -> dict[int, _Task]:

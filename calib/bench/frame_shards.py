@@ -19,7 +19,7 @@ from .bench import BenchError
 from .scene_frames import SHARD_FRAMES
 
 SHARD_FORMAT = "skin-training-frames"
-EXTRA = "tables"
+TABLES_EXTRA = "tables"
 SKINS = "skins.parquet"
 MARK, SKIN = b"jaxeit_mark", b"jaxeit_skin"  # metadata of a Parquet file: its card, and the arrays of its skin
 
@@ -136,10 +136,10 @@ class ParquetShards(AbstractShards):
     def is_whole(self, path: Path, mark: str, rows: int) -> bool:
         if not path.is_file():
             return False
-        parquet = library("pyarrow.parquet", EXTRA)
+        parquet = library("pyarrow.parquet", TABLES_EXTRA)
         try:
             about = parquet.read_metadata(path)
-        except library("pyarrow", EXTRA).ArrowException:
+        except library("pyarrow", TABLES_EXTRA).ArrowException:
             return False
         return bool(about.num_rows == rows and (about.metadata or {}).get(MARK) == mark.encode())
 
@@ -153,20 +153,20 @@ class ParquetShards(AbstractShards):
 
     def read(self, path: Path, names: Collection[str], mark: str, rows: int) -> dict[str, np.ndarray]:
         try:
-            with library("pyarrow.parquet", EXTRA).ParquetFile(path) as file:
+            with library("pyarrow.parquet", TABLES_EXTRA).ParquetFile(path) as file:
                 metadata = file.metadata.metadata or {}
                 _require(path, metadata.get(MARK) == mark.encode(), file.metadata.num_rows == rows)
                 skin = json.loads(metadata[SKIN])
                 kept = [name for name in names if name not in skin]
                 columns = file.read(columns=kept)
-        except library("pyarrow", EXTRA).ArrowException as error:
+        except library("pyarrow", TABLES_EXTRA).ArrowException as error:
             raise BenchError(f"{path}: is damaged ({error}); give the command that writes it again") from error
         found = {name: _array(columns[name]) for name in kept}
         return found | {name: np.asarray(skin[name], float) for name in names if name in skin}
 
     def finish(self, folder: Path, shards: range, about: Descriptions) -> None:
         """Write the arrays of all skins, a row for each shard."""
-        read = library("pyarrow.parquet", EXTRA).read_metadata
+        read = library("pyarrow.parquet", TABLES_EXTRA).read_metadata
         metadata = [read(self.path(folder, number)).metadata for number in shards]
         skins = [json.loads(each[SKIN]) for each in metadata]
         columns = {"shard": np.asarray(shards, "i4")}
@@ -186,7 +186,7 @@ def _require(path: Path, belongs: bool, is_whole: bool) -> None:
 
 
 def _write_table(path: Path, columns: Arrays, about: Descriptions, metadata: Mapping[bytes, bytes]) -> None:
-    pa, parquet = library("pyarrow", EXTRA), library("pyarrow.parquet", EXTRA)
+    pa, parquet = library("pyarrow", TABLES_EXTRA), library("pyarrow.parquet", TABLES_EXTRA)
     arrays = [_lists(pa, values) for values in columns.values()]
     fields = [
         pa.field(name, array.type, nullable=False, metadata=_described(about.get(name)))

@@ -23,7 +23,7 @@ from .random_scenes import MAX_CONTACTS, Footprint, RandomScenes
 from .scene_frames import SHARD_FRAMES
 
 FORMAT = "jaxeit-training-frames"
-VERSION = 2  # of the content: equal seeds give equal frames within a version
+FRAMES_VERSION = 2  # of the content: equal seeds give equal frames within a version
 CARD = "card.json"
 COUNTS = ("frames", "shards", "arrays")  # entries of a card that change where frames are added
 FIXED_BYTES = 1 << 16  # of a shard: headers
@@ -161,7 +161,7 @@ def card_of(made: FrameSet, mark: str, versions: Mapping[str, str]) -> str:
     skin = made.bench.scene.skin
     card = {
         "format": FORMAT,
-        "version": VERSION,
+        "version": FRAMES_VERSION,
         "simulated": True,
         "frames": made.frames,
         "shards": made.shards,
@@ -224,9 +224,9 @@ def _read_card(path: Path) -> dict[str, Any]:
         raise BenchError(f"{path}: is no card of a data set ({error}); give another folder") from error
     types = {"frames": int, "arrays": dict, "mark": str}
     typed = isinstance(card, dict) and all(isinstance(card.get(name), kind) for name, kind in types.items())
-    known = typed and card.get("format") == FORMAT and card.get("version") == VERSION
+    known = typed and card.get("format") == FORMAT and card.get("version") == FRAMES_VERSION
     if not known or card["frames"] < 1 or card.get("file_format", "hdf5") not in SHARDS:
-        raise BenchError(f"{path}: is no card of {FORMAT} version {VERSION}; give another folder")
+        raise BenchError(f"{path}: is no card of {FORMAT} version {FRAMES_VERSION}; give another folder")
     return card
 
 

@@ -15,10 +15,10 @@ from ..presses.table import Level, Processing, resting_levels
 from ..session import ArchiveWriter, Session
 from ..session.given import require_session
 from .calibration import Calibration
-from .force_maps import USED, ForceEstimate
+from .force_maps import USED_PARTS, ForceEstimate
 from .frame_blocks import FrameBlock, FrameBlocks, Progress, estimated
 from .given import require_calibration, require_no_eit_choices
-from .localisation.contact_tracks import ABOUT, ContactTracks, NotFollowed, quiet_tracker
+from .localisation.contact_tracks import TRACK_ARRAYS, ContactTracks, NotFollowed, quiet_tracker
 from .localisation.load_windows import SeenLoads, WindowedFrames, fit_windows
 from .localisation.proposals import ProposalChoice, chosen_proposal
 from .logs.calibration import LogCalibration
@@ -26,7 +26,7 @@ from .logs.procedure import apply_log
 from .places_in_space import normals_in_space, pad_centres, points_in_space
 from .recalibration.agreement import agreement_of_use
 
-FORMAT = "skin-forcemap"
+FORCE_MAP_FORMAT = "skin-forcemap"
 TRACKS = "tracks/"  # group of the arrays of contacts that were followed
 LOADS = "loads/"  # group of the arrays of loads in windows
 LEVELS = 64  # times at which the level without contact is averaged
@@ -79,7 +79,7 @@ def apply(
     processing = processing or calibration.processing
     proposed = None if loads is None else chosen_proposal(proposal, calibration.skin, tell, load_settings)
     levels = resting_levels(session, calibration.skin, processing)
-    ignored = accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED)
+    ignored = accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED_PARTS)
     calibration, outside = _agreement(calibration, session, levels)
     attrs = _attributes(calibration, session) | {"ignored_errors": "\n".join(ignored), "outside": "\n".join(outside)}
     if loads is not None and load_settings is not None:
@@ -87,7 +87,7 @@ def apply(
     for line in outside:
         tell(f"note: {line}")
     blocks = FrameBlocks(session, processing, levels)
-    with ArchiveWriter(path, FORMAT, {name: value for name, value in attrs.items() if value != ""}) as writer:
+    with ArchiveWriter(path, FORCE_MAP_FORMAT, {name: value for name, value in attrs.items() if value != ""}) as writer:
         kinds = _begin_rows(writer, calibration, session.epoch)
         also: list[_Loads | _Tracks] = []
         if loads is not None:
@@ -245,19 +245,19 @@ class _Tracks:
         except NotFollowed as error:
             self._why = f"contacts: none followed: {error}"
             return
-        for name, about in ABOUT.items():
+        for name, about in TRACK_ARRAYS.items():
             writer.add_rows(TRACKS + name, *about)
 
     def add(self, block: FrameBlock, found: ForceEstimate) -> None:
         if self._tracks is not None:
             rows = self._tracks.add(block.time, block.change, found.force, found.standard_error)
-            _append(self._writer, rows, ABOUT, TRACKS)
+            _append(self._writer, rows, TRACK_ARRAYS, TRACKS)
 
     def end(self) -> str:
         """Write the rows that are left; returns how many contacts there were in one line."""
         if self._tracks is None:
             return self._why
-        _append(self._writer, self._tracks.end(), ABOUT, TRACKS)
+        _append(self._writer, self._tracks.end(), TRACK_ARRAYS, TRACKS)
         return self._tracks.render()
 
 

@@ -17,9 +17,9 @@ import jaxeit as je
 from ..fitting.held_out import Split, interval, place_draws
 
 CALIBRATED = "calibrated"
-THIRDS = ("small", "middle", "large")
+FORCE_THIRDS = ("small", "middle", "large")
 """Thirds of the range of force, up to the largest of the presses."""
-METHODS = {
+FORCE_METHODS = {
     "eit": "EIT only",
     "hybrid": "hybrid",
     CALIBRATED: "calibrated",
@@ -66,7 +66,7 @@ class Evaluation:
     | centre of the sheet                                                | (2,)            | m    |
     | held_out_by: what the fit had not seen, "location" or "session";   |                 |      |
     |   empty if it had seen all                                         |                 |      |
-    | others: total force by other methods of `METHODS`, held out alike  | (presses,) each | N    |
+    | others: total force by other `FORCE_METHODS`, held out alike       | (presses,) each | N    |
     | recipe: curve and location of the calibration, in words            |                 |      |
     | splits: errors with pads, indenters or sessions held out           |                 |      |
     | notes: remarks for the reader of the results                       |                 |      |
@@ -152,7 +152,7 @@ class Evaluation:
         known = np.isfinite(self.half_width)
         inside = np.abs(self.total_force - self.force) <= self.half_width
         third = np.minimum((3 * self.force / self.force.max()).astype(int), 2)
-        parts = {name: known & (third == k) for k, name in enumerate(THIRDS)}
+        parts = {name: known & (third == k) for k, name in enumerate(FORCE_THIRDS)}
         out = {"coverage": float(inside[known].mean())}
         return out | {f"coverage_{name}": float(inside[part].mean()) for name, part in parts.items() if part.any()}
 
@@ -186,7 +186,7 @@ class Evaluation:
         mark = "" if name == CALIBRATED else f"{name}_"
         keys = [f"cv_{name}_ddof1", f"cv_{name}_se"]
         keys += [f"force_{mark}{k}" for k in ("rmse", "rmse_percent_full_scale", "mean_absolute", "worst")]
-        return MethodErrors(METHODS[name] + recipe, *(float(s.get(key, np.nan)) for key in keys))
+        return MethodErrors(FORCE_METHODS[name] + recipe, *(float(s.get(key, np.nan)) for key in keys))
 
     def _errors(self, total: np.ndarray) -> dict[str, float]:
         error = total - self.force
@@ -236,7 +236,7 @@ class Evaluation:
         for name, estimate in self.estimated.items():
             out[f"estimated_{name}"] = (estimate, "m", f"position estimated by {name}")
         for name, total in self.others.items():
-            out[f"force_{name}"] = (total, "N", f"total force by {METHODS[name]}, {self.held_out}")
+            out[f"force_{name}"] = (total, "N", f"total force by {FORCE_METHODS[name]}, {self.held_out}")
         return out
 
     @classmethod
@@ -253,7 +253,7 @@ class Evaluation:
             **{name: arrays[array + name] for name in names},
             estimated=named("estimated_"),
             half_width=arrays.get(array + "half_width"),
-            others={name: total for name, total in named("force_").items() if name in METHODS},
+            others={name: total for name, total in named("force_").items() if name in FORCE_METHODS},
             recipe=str(attrs.get(f"{attribute}recipe", "")),
             splits=tuple(Split(**split) for split in json.loads(str(attrs.get(f"{attribute}splits", "[]")))),
             held_out_by=str(attrs[f"{attribute}held_out_by"]),
@@ -324,7 +324,9 @@ def _coverage_lines(s: Mapping[str, float]) -> list[str]:
     """How many presses lie in their interval; none without intervals."""
     if "coverage" not in s:
         return []
-    thirds = ", ".join(f"{name} {100 * s[f'coverage_{name}']:.0f} %" for name in THIRDS if f"coverage_{name}" in s)
+    thirds = ", ".join(
+        f"{name} {100 * s[f'coverage_{name}']:.0f} %" for name in FORCE_THIRDS if f"coverage_{name}" in s
+    )
     return [f"    in their 90 % interval: {100 * s['coverage']:.0f} % of the presses (forces in thirds: {thirds})"]
 
 

@@ -21,7 +21,7 @@ from .calibration import Calibration, real_rows
 from .given import require_calibration
 from .localisation.locators import AbstractLocator, locate
 
-USED = ("/device", "/streams/eit", "/streams/pressure")  # parts of a session from which forces are computed
+USED_PARTS = ("/device", "/streams/eit", "/streams/pressure")  # parts of a session from which forces are computed
 
 
 class ForceEstimate(NamedTuple):

@@ -13,7 +13,7 @@ from ..presses.table import PressMeasurements, Processing, measure, resting_leve
 from ..session import Session, SessionError
 from .calibration import Calibration
 from .fitted_sessions import is_calibrated_from
-from .force_maps import USED
+from .force_maps import USED_PARTS
 from .frame_blocks import FrameBlocks, Progress, estimated
 from .localisation.contact_tracks import (
     ContactTracks,
@@ -76,7 +76,7 @@ def learn_layer(
     """
     processing = processing or calibration.processing
     levels = resting_levels(session, calibration.skin, processing)
-    accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED)
+    accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED_PARTS)
     before = None if calibration.layer is None else calibration.layer.aged(FORGOTTEN)
     law = ContactLaw.unknown() if calibration.contact_law is None else calibration.contact_law.aged(FORGOTTEN)
     try:

@@ -32,7 +32,7 @@ from ..session.given import require_session, require_skin_or_none, sessions_of
 from .archives.storage import describe
 from .calibration import Calibration
 from .evaluation import Evaluation, centre_of
-from .fitted_sessions import FITTED, holds_presses, is_fitted, require_each_once
+from .fitted_sessions import FITTED_NOTE, holds_presses, is_fitted, require_each_once
 from .given import require_calibration, require_no_eit_choices
 from .hysteresis_loops import typical_loops
 from .layer import learn_layer
@@ -312,7 +312,7 @@ def _evaluation(calibration: Calibration, session: Session, processing: Processi
         image_sum=images.integral,
         centre=centre_of(calibration.skin),
         held_out_by="" if fitted else "session",
-        notes=(*([FITTED] if fitted else []), *ignored, *found.notes, *agreement.notes),
+        notes=(*([FITTED_NOTE] if fitted else []), *ignored, *found.notes, *agreement.notes),
         others=_compared_forces(calibration, found, images.integral),
         recipe=calibration.evaluation.recipe,
     )

@@ -44,7 +44,7 @@ AUTO_CURVES = ("linear", "power", "polynomial", "spline")
 """Curves that ``auto`` stands for: zero at zero pressure, so that idle pads add nothing, and without memory."""
 NONE = "none"
 DEFAULT = "default"  # corrections: a low-pass where a stream holds something to remove
-LEVELS: Mapping[str, Callable[..., je.Fidelity]] = {
+FIDELITY_LEVELS: Mapping[str, Callable[..., je.Fidelity]] = {
     "draft": je.Fidelity.draft,
     "standard": je.Fidelity.standard,
     "reference": je.Fidelity.reference,
@@ -195,7 +195,7 @@ def _read_switch(table: TomlTable, name: str) -> bool:
 
 
 def _read_fidelity(table: TomlTable) -> je.Fidelity:
-    known = ", ".join(LEVELS)
+    known = ", ".join(FIDELITY_LEVELS)
     value = table.get("fidelity", lambda v: isinstance(v, str | dict), f"one of {known}, or a table")
     if isinstance(value, dict):
         return _fidelity(table.table("fidelity"))
@@ -204,14 +204,14 @@ def _read_fidelity(table: TomlTable) -> je.Fidelity:
 
 
 def _fidelity(table: TomlTable) -> je.Fidelity:
-    level = table.choice("level", *LEVELS, default="standard")
+    level = table.choice("level", *FIDELITY_LEVELS, default="standard")
     settings = je.registry.settings_of(je.Fidelity, (je.linalg.SOLVERS,))
     changes = {name: setting.read(table) for name, setting in settings.items() if table.has(name)}
     if table.has("dtype"):
         changes["dtype"] = table.choice("dtype", "float32", "float64")
     table.done()
     try:
-        return LEVELS[level](**changes)
+        return FIDELITY_LEVELS[level](**changes)
     except ValueError as error:
         raise table.error("fidelity", str(error)) from None
 

@@ -19,7 +19,7 @@ SIGNIFICANCE = 4.0  # standard errors of a shift; honest sessions reach 1.7
 SMALLEST_SHIFT = 5e-4  # m; smaller shifts cost less than the coat does
 MIN_SOUND = 0.5  # share of the readings that must be sound
 
-WHERE = "/device"
+DEVICE_PATH = "/device"
 OTHER_CAUSE = "look for faulty contacts, a common mode of the amplifier, or another skin than the file describes"
 
 
@@ -32,25 +32,25 @@ def check_electrodes(
     """
     obstacle = _obstacle(skin, table, order)
     if skin is None or table is None or obstacle:
-        findings.append(Finding(Severity.OK, WHERE, f"places of the electrodes not checked: {obstacle}"))
+        findings.append(Finding(Severity.OK, DEVICE_PATH, f"places of the electrodes not checked: {obstacle}"))
         return ()
     try:
         fit = fit_electrodes(je.discretise(je.Scene(skin), ELECTRODE_FIDELITY), np.where(table.bad, np.nan, table.mean))
     except ValueError as error:
-        findings.append(Finding(Severity.OK, WHERE, f"places of the electrodes not checked: {error}"))
+        findings.append(Finding(Severity.OK, DEVICE_PATH, f"places of the electrodes not checked: {error}"))
         return ()
     if not float(fit.misfit) < LARGEST_MISFIT:
         what = (
             "no places of the electrodes explain the untouched frame: what is left of it is "
             f"{float(fit.misfit):.2g} times the errors of a model"
         )
-        findings.append(Finding(Severity.WARNING, WHERE, what, OTHER_CAUSE))
+        findings.append(Finding(Severity.WARNING, DEVICE_PATH, what, OTHER_CAUSE))
         return ()
     if not fit.converged:
         what = (
             "the fit of the places of electrodes has not converged: shifts may err by more than their standard errors"
         )
-        findings.append(Finding(Severity.OK, WHERE, what))
+        findings.append(Finding(Severity.OK, DEVICE_PATH, what))
     rows = _rows(fit)
     findings += _findings(rows)
     return rows
@@ -92,7 +92,7 @@ def _findings(rows: tuple[ElectrodeRow, ...]) -> Iterator[Finding]:
             "no electrode seems to sit elsewhere than the skin's file says; the untouched frame tells their places to "
             f"{errors.min():.1g} to {errors.max():.1g} mm (standard errors; 1 mm is what was believed before)"
         )
-        yield Finding(Severity.OK, WHERE, what)
+        yield Finding(Severity.OK, DEVICE_PATH, what)
         return
     said = listed(
         f"no. {row.electrode} by {1e3 * np.hypot(row.x, row.y):.1f} +- {1e3 * row.error:.1f} mm "
@@ -104,4 +104,4 @@ def _findings(rows: tuple[ElectrodeRow, ...]) -> Iterator[Finding]:
         "measure where they sit and correct their positions in the skin's file, or calibrate with --fit-electrodes, "
         "which tells places better by the presses"
     )
-    yield Finding(Severity.WARNING, WHERE, what, remedy)
+    yield Finding(Severity.WARNING, DEVICE_PATH, what, remedy)

@@ -16,7 +16,7 @@ from jaxeit.model import MotionError
 
 from ..session import Session
 from ..session.mixing import same_scan
-from .electrodes import OTHER_CAUSE, WHERE
+from .electrodes import DEVICE_PATH, OTHER_CAUSE
 from .report import CheckReport, Finding, Severity
 
 # The mesh of a calibration, whose programs are compiled for its coat already.
@@ -58,10 +58,10 @@ def placement_finding(
             "neither a coat nor places of the electrodes explain the untouched frame: of a reading "
             f"{100 * float(found.error):.0f} % are left; places of contacts and forces of the image may be wrong"
         )
-        return Finding(Severity.WARNING, WHERE, what, OTHER_CAUSE)
+        return Finding(Severity.WARNING, DEVICE_PATH, what, OTHER_CAUSE)
     if float(found.evidence) < MIN_EVIDENCE or float(found.size) < MIN_SIZE:
         return None
-    return Finding(Severity.WARNING, WHERE, _what(found), REMEDY)
+    return Finding(Severity.WARNING, DEVICE_PATH, _what(found), REMEDY)
 
 
 def placement_note(

@@ -22,11 +22,11 @@ from .presses.pad_responses import pad_response_findings
 from .presses.pads import check_pads
 from .presses.places import place_findings
 from .presses.responses import reading_response_findings
-from .presses.usable import NAMES, list_presses, press_evidence, press_summary
+from .presses.usable import NEEDED_STREAMS, list_presses, press_evidence, press_summary
 from .report import ChannelTable, CheckReport, Finding, Severity
 from .skin import check_skin
 from .streams.clipping import clipping_findings
-from .streams.clocks import CLOCKS_DISAGREE, COMPARED, compare_clocks
+from .streams.clocks import CLOCKS_DISAGREE, COMPARED_STREAMS, compare_clocks
 from .streams.dropouts import dropout_findings
 from .streams.shifts import shift_findings
 from .streams.statistics import Progress, StreamStatistics, copy_findings, stream_findings, stream_statistics
@@ -117,7 +117,7 @@ def _compare(
     onsets = compare_clocks(statistics, evidence, findings)
     moved = _streams_of_wrong_clocks(statistics, evidence, findings)
     # What a wrong clock makes of the presses looks like wrong signs, places and pads.
-    if "force" in statistics and not ({*COMPARED} & {*statistics} <= moved and moved):
+    if "force" in statistics and not ({*COMPARED_STREAMS} & {*statistics} <= moved and moved):
         wrong = [*force_findings(evidence, skin, statistics["force"])]
         findings += wrong
         # What a wrong force makes of the pads looks like a wrong scale of them.
@@ -146,7 +146,7 @@ def _streams_of_wrong_clocks(
     if found is None:
         return set()
     findings.append(found)
-    return {*NAMES}
+    return {*NEEDED_STREAMS}
 
 
 def _session_findings(session: Session) -> Iterator[Finding]:

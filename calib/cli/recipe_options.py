@@ -16,7 +16,7 @@ from ..calibration.localisation.locators import LOCATORS
 from ..calibration.recipe_text import (
     AUTO,
     DEFAULT,
-    LEVELS,
+    FIDELITY_LEVELS,
     NONE,
     SWITCHES,
     curve_choice,
@@ -55,7 +55,7 @@ def add_recipe_arguments(parser: argparse.ArgumentParser) -> None:
     )
     text = "folds of the cross-validation over places; with K of at least the number of places, "
     group.add_argument("--folds", type=count, metavar="K", help=text + "one place is left out at a time; default: 5")
-    _choice(group, "--fidelity", LEVELS, "accuracy of the finite-element model", default="standard")
+    _choice(group, "--fidelity", FIDELITY_LEVELS, "accuracy of the finite-element model", default="standard")
     text = "assume that the sheet is even; default: its conductivity is fitted to the untouched frames"
     _switch(group, "--even-sheet", text)
     text = (

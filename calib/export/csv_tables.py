@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxeit.files import open_regular
 
-from ..calibration.application import FORMAT as FORCE_MAP, TRACKS
+from ..calibration.application import FORCE_MAP_FORMAT, TRACKS
 from ..calibration.frame_blocks import Progress
 from ..calibration.logs.procedure import FORCE_FORMAT as LOG_FORCES
 from ..session import ArchiveReader, open_archive
@@ -74,7 +74,7 @@ def export_csv(
     require_no_session(output)
     _require_own(output, (LOG_HEAD, PAD_HEAD))
     kind = archive_format(source)
-    if kind not in (FORCE_MAP, LOG_FORCES):
+    if kind not in (FORCE_MAP_FORMAT, LOG_FORCES):
         what = f"is {printable(kind)!r}" if kind else "has no format"
         raise problem(source, "file", what, "name a force map of `jaxeit apply`")
     with open_archive(source, kind) as archive, folder_beside(output) as folder:

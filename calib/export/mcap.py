@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.application import FORMAT as FORCE_MAP, TRACKS
+from ..calibration.application import FORCE_MAP_FORMAT, TRACKS
 from ..calibration.frame_blocks import Progress
 from ..session import ArchiveReader, Session, Stream, open_archive, open_session
 from ..session.archive import archive_format
 from ..session.errors import printable, problem
 from ..session.reader import epoch_nanoseconds
-from ..session.tables import FORMAT as SESSION
+from ..session.tables import SESSION_FORMAT
 from . import mcap_messages as ros
 from .force_map_topics import PAD_COLUMNS, PICTURES, PLACE_COLUMNS, TRACK_COLUMNS, ForceMapTopics, SkinLayout
 from .mcap_writer import Bag, require_frame, require_stamps, topic_names, topic_prefix, writing_bag
@@ -74,11 +74,11 @@ def export_mcap(
     source, output = Path(source), Path(output)
     prefix, frame_id = topic_prefix(prefix), require_frame(frame_id)
     kind = archive_format(source)
-    if kind == FORCE_MAP:
-        with open_archive(source, FORCE_MAP) as archive, writing_bag(output) as bag:
+    if kind == FORCE_MAP_FORMAT:
+        with open_archive(source, FORCE_MAP_FORMAT) as archive, writing_bag(output) as bag:
             times = _ForceMapBag(bag, archive, prefix, frame_id).write(progress)
             return _summary(bag, times)
-    if kind == SESSION:
+    if kind == SESSION_FORMAT:
         with open_session(source) as session, writing_bag(output) as bag:
             return _summary(bag, _write_session(bag, session, prefix, progress))
     what = f"is {printable(kind)!r}" if kind else "has no format"

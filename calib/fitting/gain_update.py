@@ -24,7 +24,7 @@ from ..presses.streams import robust_deviation
 USUAL = 2.0  # deviations
 STEPS = 30
 TOLERANCE = 1e-7  # largest step of a log gain at the end
-DETERMINED = 0.5  # standard deviation of a determined gain over that of its prior, at most
+DETERMINED_RATIO = 0.5  # standard deviation of a determined gain over that of its prior, at most
 
 
 class GainPrior(NamedTuple):
@@ -145,4 +145,4 @@ def relative(covariance: Float[np.ndarray, "pads pads"]) -> Float[np.ndarray, "p
 
 def _determined(prior: GainPrior, posterior: np.ndarray, is_relative: bool) -> np.ndarray:
     before, after = (relative(c) if is_relative else c for c in (prior.covariance, posterior))
-    return np.asarray(np.diag(after) < DETERMINED**2 * np.diag(before))
+    return np.asarray(np.diag(after) < DETERMINED_RATIO**2 * np.diag(before))

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..calibration.calibration import Calibration
-from ..calibration.evaluation import CALIBRATED, METHODS, Evaluation
+from ..calibration.evaluation import CALIBRATED, FORCE_METHODS, Evaluation
 from ..calibration.press_examples import PressExamples
 from ..fitting.fields import FIELDS, FittedField
 from .figures.presses import ESTIMATOR_MEANING, sensitivity_maps
@@ -61,7 +61,7 @@ def about_curved(estimator: str) -> tuple[str, str]:
 def about_sensitivity(evaluation: Evaluation) -> tuple[str, str]:
     """Alternative text and caption of the maps of sensitivity."""
     s, maps = evaluation.summary(), sensitivity_maps(evaluation)
-    spreads = [f"{METHODS[name]} {number_text(s.get(f'cv_{name}_ddof1', math.nan), 3)}" for name in maps]
+    spreads = [f"{FORCE_METHODS[name]} {number_text(s.get(f'cv_{name}_ddof1', math.nan), 3)}" for name in maps]
     alt = (
         f"{len(maps)} maps of sensitivity over its mean at every place pressed; coefficients of variation: "
         f"{', '.join(spreads)}."

@@ -10,7 +10,7 @@ import numpy as np
 import jaxeit as je
 
 from ..calibration.calibration import Calibration
-from ..calibration.evaluation import METHODS, THIRDS, Evaluation, localisation_errors
+from ..calibration.evaluation import FORCE_METHODS, FORCE_THIRDS, Evaluation, localisation_errors
 from ..calibration.given import require_calibration
 from ..fitting.selection import Candidate
 from ..session import replacing
@@ -171,7 +171,7 @@ def _coverage(found: Evaluation) -> str:
     s = found.summary()
     if "coverage" not in s:
         return ""
-    thirds = [f"{name} {100 * s[f'coverage_{name}']:.0f} %" for name in THIRDS if f"coverage_{name}" in s]
+    thirds = [f"{name} {100 * s[f'coverage_{name}']:.0f} %" for name in FORCE_THIRDS if f"coverage_{name}" in s]
     return f"{100 * s['coverage']:.0f} % of all presses; thirds of the force: {', '.join(thirds)}."
 
 
@@ -190,7 +190,7 @@ def _results(calibration: Calibration, evaluations: Mapping[str, Evaluation]) ->
         for name, e in _all(calibration, evaluations).items()
     }
     if calibration.skin.name == PAPERS_SKIN:
-        groups[_PAPER] = [(METHODS[name], cv, *["—"] * 4) for name, cv in _PAPER_CV.items()]
+        groups[_PAPER] = [(FORCE_METHODS[name], cv, *["—"] * 4) for name, cv in _PAPER_CV.items()]
     head = ["total force by", "CV, ddof 1", "RMSE, N", "RMSE, % of largest", "mean absolute, N", "worst, N"]
     about = (
         "EIT only: the integral of the image times one number; hybrid: the paper's recipe, one slope a pad; "

@@ -11,7 +11,7 @@ from ..calibration.localisation.ellipses import INSIDE_90, placement_covariance
 from ..calibration.localisation.locators import CentroidLocator, ContactLocator
 from ..calibration.localisation.press_images import REPORTED_ESTIMATORS
 
-LARGER = 5  # times that ellipses are drawn larger, since they would hardly be seen
+ELLIPSE_MAGNIFICATION = 5  # times that ellipses are drawn larger, since they would hardly be seen
 SMALL = 0.02  # half axis over the longer side of the sheet, below which ellipses are drawn larger
 IMAGE_ESTIMATOR = "quarter"  # of `REPORTED_ESTIMATORS`, where the calibration has no locator
 
@@ -32,12 +32,12 @@ class ExampleContacts:
     covariance: np.ndarray
 
     def magnification(self, skin: je.Skin) -> int:
-        """Times that the ellipses are drawn larger than they are: `LARGER` or 1, where they can be seen."""
+        """Times that ellipses are drawn larger than they are: `ELLIPSE_MAGNIFICATION`, or 1 where they can be seen."""
         known = self.covariance[np.isfinite(self.position).all(1)]
         if not len(known) or not np.isfinite(known).all():
             return 1
         low, high = np.array(skin.domain.bounds)
-        return LARGER if half_axes(known).max() < SMALL * (high - low).max() else 1
+        return ELLIPSE_MAGNIFICATION if half_axes(known).max() < SMALL * (high - low).max() else 1
 
 
 def half_axes(covariance: np.ndarray) -> np.ndarray:

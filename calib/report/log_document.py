@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 
 from ..calibration.logs.calibration import LogCalibration
-from ..calibration.logs.evaluation import THIRDS, LogEvaluation
+from ..calibration.logs.evaluation import LOG_THIRDS, LogEvaluation
 from ..session import replacing
 from .figures.logs import place_panels, residual_figure, scatter_figure, time_figure
 from .figures.panels import inline_svg
@@ -105,8 +105,8 @@ def _residuals(found: Mapping[str, LogEvaluation]) -> str:
 
 
 def _coverage(found: Mapping[str, LogEvaluation]) -> str:
-    head = ["recording", "all", *(f"{name} third of force" for name in THIRDS), "outside the calibrated range"]
-    keys = ("coverage", *(f"coverage_{name}" for name in THIRDS), "outside_share")
+    head = ["recording", "all", *(f"{name} third of force" for name in LOG_THIRDS), "outside the calibrated range"]
+    keys = ("coverage", *(f"coverage_{name}" for name in LOG_THIRDS), "outside_share")
     rows = [(name, *(_percent(one.summary()[key]) for key in keys)) for name, one in found.items()]
     about = (
         "Share of the samples within the 90 % interval of a reading. An honest interval holds 85 to 95 %. Samples "

@@ -9,14 +9,14 @@ import numpy as np
 
 import jaxeit as je
 
-from ..calibration.application import FORMAT, LOADS, TRACKS
+from ..calibration.application import FORCE_MAP_FORMAT, LOADS, TRACKS
 from ..calibration.localisation import load_windows
-from ..calibration.localisation.contact_tracks import ABOUT, Rows
+from ..calibration.localisation.contact_tracks import TRACK_ARRAYS, Rows
 from ..calibration.localisation.ellipses import INSIDE_90, confidence_ellipse
 from ..session import open_archive, replacing
-from .example_contacts import LARGER
+from .example_contacts import ELLIPSE_MAGNIFICATION
 from .figures.force_series import SERIES
-from .figures.panels import WIDER, Panel, chart_axes, panel, sheet_axes
+from .figures.panels import WIDE_PANEL_WIDTH, Panel, chart_axes, panel, sheet_axes
 from .figures.parts import MM, require_matplotlib
 from .html_parts import PAGE, STYLE, html_table, number_text, with_error
 from .load_report import load_parts
@@ -25,8 +25,8 @@ ELLIPSES = 5  # of a contact, where it presses with at least half of its largest
 MOST_POINTS = 2000  # of a contact's line
 CAPTION = (
     "Paths of the contacts, each with its number where it begins and a dot where it ends; an edge is a line. Ellipses "
-    f"of 90 %, drawn {LARGER} times larger, where a contact presses with at least half of its largest force. Beside "
-    "them the forces, with two standard errors on either side."
+    f"of 90 %, drawn {ELLIPSE_MAGNIFICATION} times larger, where a contact presses with at least half of its largest "
+    "force. Beside them the forces, with two standard errors on either side."
 )
 
 
@@ -44,10 +44,10 @@ def write_track_report(path: str | Path, forces: str | Path, skin: je.Skin) -> P
     """
     require_matplotlib()
     page = Path(path)
-    with open_archive(forces, FORMAT) as archive:
+    with open_archive(forces, FORCE_MAP_FORMAT) as archive:
         attrs, known = archive.attrs, archive.arrays
-        rows = {name: known[TRACKS + name].read() for name in ABOUT if TRACKS + name in known}
-        loads = {name: known[LOADS + name].read() for name in load_windows.ABOUT if LOADS + name in known}
+        rows = {name: known[TRACKS + name].read() for name in TRACK_ARRAYS if TRACKS + name in known}
+        loads = {name: known[LOADS + name].read() for name in load_windows.LOAD_ARRAYS if LOADS + name in known}
         where = LOADS + load_windows.LEARNED
         learned = [str(line) for line in known[where].read()] if where in known else []
         told = load_parts(loads, learned, simulated=bool(attrs["simulated"]))
@@ -105,13 +105,13 @@ def tracks_panels(rows: Rows, skin: je.Skin, *, simulated: bool = False) -> list
     """Paths of contacts over the sheet, with ellipses of 90 %, and their forces over time.
 
     Args:
-        rows: of the contacts, by the names of `ABOUT`.
+        rows: of the contacts, by the names of `TRACK_ARRAYS`.
 
     Raises:
         ReportError: matplotlib is not installed.
     """
-    over_sheet, sheet, _ = sheet_axes(skin, simulated=simulated, width=WIDER)
-    over_time, forces = chart_axes(simulated=simulated, width=WIDER, height=0.8 * WIDER)
+    over_sheet, sheet, _ = sheet_axes(skin, simulated=simulated, width=WIDE_PANEL_WIDTH)
+    over_time, forces = chart_axes(simulated=simulated, width=WIDE_PANEL_WIDTH, height=0.8 * WIDE_PANEL_WIDTH)
     limits = sheet.get_xlim(), sheet.get_ylim()
     for k, (number, one) in enumerate(by_number(rows).items()):
         _draw_path(sheet, number, one, SERIES[k % len(SERIES)])
@@ -131,7 +131,10 @@ def _draw_path(axes: Any, number: int, one: Rows, colour: str) -> None:
     axes.annotate(str(number), place[0], xytext=(4, 4), textcoords="offset points", color=colour, fontsize=9)
     pressing = np.flatnonzero(one["force"] >= one["force"].max() / 2)
     for at in pressing[_thinned(len(pressing), ELLIPSES)]:
-        ellipse = confidence_ellipse(one["position"][at], one["position_covariance"][at], LARGER * INSIDE_90) * MM
+        ellipse = (
+            confidence_ellipse(one["position"][at], one["position_covariance"][at], ELLIPSE_MAGNIFICATION * INSIDE_90)
+            * MM
+        )
         axes.plot(*ellipse.T, color=colour, lw=0.7, alpha=0.8)
         ends = place[at] + np.outer([-1, 1], one["half"][at] * MM)
         axes.plot(*ends.T, color=colour, lw=2.4, alpha=0.5)

@@ -35,7 +35,7 @@ from .hdf5.storage import (
     text_array,
 )
 from .reader import check_version
-from .tables import FORMAT
+from .tables import SESSION_FORMAT
 
 ARCHIVE_VERSION = "1.0"
 MAX_DEPTH = 4
@@ -127,7 +127,7 @@ class ArchiveWriter(FileWriter):
     def __init__(self, path: str | os.PathLike[str], format: str, attrs: Mapping[str, AttributeValue]):
         super().__init__(Path(path))
         clash = OWN_ATTRIBUTES & set(attrs)
-        if clash or format == FORMAT or not PART.fullmatch(format):
+        if clash or format == SESSION_FORMAT or not PART.fullmatch(format):
             what = f"format {format!r} or attributes {sorted(clash)} are reserved"
             raise problem(self.path, "attributes", what, "use other names")
         own = {"format": format, "format_version": ARCHIVE_VERSION, "Conventions": "CF-1.11"}

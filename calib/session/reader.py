@@ -18,7 +18,7 @@ from .hdf5.members import SCHEMA, column, declared_unit, required, small_array
 from .hdf5.storage import file_hash
 from .mixing import TERMS, count_readings, mixing_of_terms
 from .stream import Stream
-from .tables import CLOCK_ATTRIBUTES, FORMAT, PRESS_COLUMNS, ClockTable, Events, PressTable
+from .tables import CLOCK_ATTRIBUTES, PRESS_COLUMNS, SESSION_FORMAT, ClockTable, Events, PressTable
 from .units import Unit
 
 MAX_STREAMS = 64
@@ -228,8 +228,8 @@ def _check_format(root: Node) -> None:
         what = "is HDF5 but not a session (no attribute `format`)"
         raise problem(root.path, "file", what, "name a file written by jaxeit, or import it")
     found = root.text("format")
-    if found != FORMAT:
-        what = f"is a {printable(found)!r} file, not a {FORMAT!r}"
+    if found != SESSION_FORMAT:
+        what = f"is a {printable(found)!r} file, not a {SESSION_FORMAT!r}"
         raise problem(root.path, "file", what, "name a session file")
     check_version(root)
 

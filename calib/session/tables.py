@@ -10,8 +10,8 @@ import numpy as np
 
 from .errors import SessionError
 
-FORMAT = "skin-session"
-VERSION = "1.0"
+SESSION_FORMAT = "skin-session"
+SESSION_VERSION = "1.0"
 MIXED_VERSION = "1.1"  # of files whose readings are sums of rows of the pattern
 STREAM_EXTRAS = {"time_device": "u8", "time_host": "i8", "seq": "u4"}
 """Optional arrays of a stream with one entry per sample, and their types: device ticks, host time, sequence number."""

@@ -32,11 +32,11 @@ from calib.session.hdf5.storage import (
 from calib.session.mixing import checked_mixing, count_readings, terms_of_mixing
 from calib.session.tables import (
     CLOCK_ATTRIBUTES,
-    FORMAT,
     MIXED_VERSION,
     PRESS_COLUMNS,
+    SESSION_FORMAT,
+    SESSION_VERSION,
     STREAM_EXTRAS,
-    VERSION,
     ClockTable,
     Column,
     Events,
@@ -104,8 +104,8 @@ class SessionWriter(FileWriter):
     def _root(self) -> dict[str, AttributeValue]:
         facts = self._facts
         out: dict[str, AttributeValue] = {
-            "format": FORMAT,
-            "format_version": VERSION if facts.mixing is None else MIXED_VERSION,
+            "format": SESSION_FORMAT,
+            "format_version": SESSION_VERSION if facts.mixing is None else MIXED_VERSION,
             "Conventions": "CF-1.11",
             "NX_class": "NXroot",
             "session_id": facts.session_id or str(uuid.uuid4()),

@@ -9,19 +9,19 @@ import pytest
 import jaxeit as je
 from calib.bench import load_bench, simulate
 from calib.bench.motion import loads_at, planned_motion
-from calib.calibration.application import FORMAT, LOADS, TRACKS
+from calib.calibration.application import FORCE_MAP_FORMAT, LOADS, TRACKS
 from calib.calibration.calibration import Calibration
 from calib.calibration.localisation import contact_tracks
 from calib.calibration.localisation.contact_tracks import (
-    ABOUT,
     GAIN_DRIFT,
     MIN_SECONDS,
     PAD_SHARE,
+    TRACK_ARRAYS,
     ContactTracks,
     NotFollowed,
     pad_errors,
 )
-from calib.calibration.localisation.load_windows import ABOUT as LOAD_ARRAYS, LEARNED
+from calib.calibration.localisation.load_windows import LEARNED, LOAD_ARRAYS
 from calib.calibration.localisation.quiet_frames import QuietFrames
 from calib.cli import main
 from calib.report.track_report import by_number, write_track_report
@@ -113,7 +113,7 @@ def test_rows_are_the_contacts_of_each_frame():
     change = np.array([[1.0], [2.0], [np.nan], [0.0], [2.0]])
     pads = np.ones((5, 2))
     parts = [tracks.add(time[s], change[s], pads[s], pads[s]) for s in (slice(0, 3), slice(3, 4), slice(4, 5))]
-    rows = {name: np.concatenate([part[name] for part in parts]) for name in ABOUT}
+    rows = {name: np.concatenate([part[name] for part in parts]) for name in TRACK_ARRAYS}
     assert (rows["time"] / S).tolist() == [0, 0, 0, 4, 4]
     assert rows["number"].tolist() == [1, 1, 2, 1, 2]
     np.testing.assert_allclose(rows["position"][:, 0], [1e-3, 2e-3, 4e-3, 5e-3, 10e-3])
@@ -154,8 +154,8 @@ def written(path, count):
         "half": np.stack([0.01 * (number == count), 0.0 * number], 1),
         "velocity": np.tile([0.1, 0.0], (len(time), 1)),
     }
-    arrays = {TRACKS + name: (rows[name], *about[1:3]) for name, about in ABOUT.items()} if count else {}
-    write_archive(path, FORMAT, {"session": "<s>.h5", "simulated": 1}, arrays)
+    arrays = {TRACKS + name: (rows[name], *about[1:3]) for name, about in TRACK_ARRAYS.items()} if count else {}
+    write_archive(path, FORCE_MAP_FORMAT, {"session": "<s>.h5", "simulated": 1}, arrays)
     return rows
 
 
@@ -194,7 +194,7 @@ def test_a_report_tells_what_touched_the_skin(tmp_path, skin):
     }
     arrays = {LOADS + name: (part, *LOAD_ARRAYS[name]) for name, part in windows.items()}
     arrays[LOADS + LEARNED] = (np.array(["pressure adds < 150 %"]), "1", "what presses told")
-    write_archive(tmp_path / "map.h5", FORMAT, {"session": "s.h5", "simulated": 1}, arrays)
+    write_archive(tmp_path / "map.h5", FORCE_MAP_FORMAT, {"session": "s.h5", "simulated": 1}, arrays)
     page = write_track_report(tmp_path / "r.html", tmp_path / "map.h5", skin).read_text()
     assert "No contact" not in page
     assert page.count("<svg") == 1
@@ -225,9 +225,9 @@ def test_two_contacts_are_followed_from_the_command_line(tmp_path, capsys):
     assert main(["apply", c, str(session), "-o", out, "--track", "--report", report]) == 0
     assert "contacts: 2 followed" in capsys.readouterr().out
     assert Path(report).read_text().count("<svg") == 2
-    archive = read_archive(out, FORMAT)
-    assert all(archive.units[TRACKS + name] == about.units for name, about in ABOUT.items())
-    rows = by_number({name: archive.arrays[TRACKS + name] for name in ABOUT})
+    archive = read_archive(out, FORCE_MAP_FORMAT)
+    assert all(archive.units[TRACKS + name] == about.units for name, about in TRACK_ARRAYS.items())
+    rows = by_number({name: archive.arrays[TRACKS + name] for name in TRACK_ARRAYS})
     motion = planned_motion(few)
     assert len(rows) == 2
     for tip, one in enumerate(rows.values()):
@@ -240,4 +240,4 @@ def test_two_contacts_are_followed_from_the_command_line(tmp_path, capsys):
 
 def test_apply_names_its_arrays_as_documented(root):
     text = (root / "docs" / "tracks.md").read_text()
-    assert all(name in text.split("tracks/...")[1] for name in ABOUT)
+    assert all(name in text.split("tracks/...")[1] for name in TRACK_ARRAYS)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import calib
-from calib.calibration.localisation.contact_tracks import ABOUT
+from calib.calibration.localisation.contact_tracks import TRACK_ARRAYS
 from calib.calibration.places_in_space import normals_in_space, pad_centres, points_in_space
 from calib.cli import main
 from calib.export.mcap_messages import turn_to
@@ -47,7 +47,7 @@ def arrays():
     pads = {name: rng.normal(size=(FRAMES, 2)) for name in ("pad_force", "pad_force_se", "pad_force_half")}
     pads["pad_force"][3, 0] = np.nan
     times, followed = np.arange(FRAMES) * 55_555_555 + 7, [1, 1, 2, 4]  # frames of the rows of contacts
-    tracks = {f"tracks/{name}": rng.normal(size=(4, *about.shape)) for name, about in ABOUT.items()}
+    tracks = {f"tracks/{name}": rng.normal(size=(4, *about.shape)) for name, about in TRACK_ARRAYS.items()}
     tracks |= {"tracks/time": times[followed], "tracks/number": np.array([1, 2, 1, 3])}
     return {
         "pixel": np.arange(pixels),

@@ -11,7 +11,7 @@ import jaxeit as je
 from calib.calibration.localisation.ellipses import INSIDE_90, placement_covariance
 from calib.calibration.press_examples import PressExamples
 from calib.report.document import write_report
-from calib.report.example_contacts import LARGER, ExampleContacts, example_contacts, half_axes
+from calib.report.example_contacts import ELLIPSE_MAGNIFICATION, ExampleContacts, example_contacts, half_axes
 from calib.report.figures.maps import ExampleMaps, draw_contact
 from calib.report.figures.panels import TALLEST, chart_axes, inline_svg, sheet_axes
 from calib.report.html_parts import PAGE, STYLE, html_table
@@ -85,18 +85,18 @@ def test_ellipses_are_those_of_the_covariance():
     axes_of = INSIDE_90 * np.linalg.svd(root, compute_uv=False)
     assert half_axes(covariance) == pytest.approx(axes_of)
     _, axes = chart_axes()
-    draw_contact(axes, np.array([0.05, 0.02]), covariance, LARGER)
+    draw_contact(axes, np.array([0.05, 0.02]), covariance, ELLIPSE_MAGNIFICATION)
     points = axes.lines[-1].get_xydata() - [50, 20]
     lengths = np.linalg.norm(points, axis=1)
-    assert [lengths.max(), lengths.min()] == pytest.approx(1e3 * LARGER * axes_of, rel=0.01)
+    assert [lengths.max(), lengths.min()] == pytest.approx(1e3 * ELLIPSE_MAGNIFICATION * axes_of, rel=0.01)
     assert np.einsum("ni,ij,nj->n", points, np.linalg.inv(covariance * 1e6), points) == pytest.approx(
-        (LARGER * INSIDE_90) ** 2
+        (ELLIPSE_MAGNIFICATION * INSIDE_90) ** 2
     )
-    draw_contact(axes, np.array([np.nan, 0.02]), covariance, LARGER)
+    draw_contact(axes, np.array([np.nan, 0.02]), covariance, ELLIPSE_MAGNIFICATION)
     assert len(axes.lines) == 2
 
 
-@pytest.mark.parametrize(("error", "larger"), [(1e-3, LARGER), (5e-3, 1)])
+@pytest.mark.parametrize(("error", "larger"), [(1e-3, ELLIPSE_MAGNIFICATION), (5e-3, 1)])
 def test_ellipses_that_would_hardly_be_seen_are_drawn_larger(skin, error, larger):
     """On a sheet of 200 mm; what was not found does not count."""
     position, covariance = np.array([[0.1, 0.1], [np.nan, np.nan]]), np.stack([error**2 * np.eye(2), np.eye(2)])

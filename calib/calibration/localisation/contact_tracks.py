@@ -28,7 +28,7 @@ from ..calibration import Calibration
 from ..frame_blocks import FrameBlocks
 from .load_windows import LOAD_FIDELITY
 from .press_images import taken_for_even
-from .quiet_frames import ENOUGH, QuietFrames
+from .quiet_frames import ENOUGH_FRAMES, QuietFrames
 
 MIN_SECONDS = 1e-4  # between frames; those that arrive together bear about the same time
 # Part of a pad's force by which curve and shape of the load may err; its standard error is that of the pressure alone.
@@ -114,7 +114,7 @@ def quiet_tracker(
     quiet = QuietFrames(calibration.recon.readings)
     for block in blocks:
         quiet.add(block.frames, block.change, block.loaded(calibration))
-        if quiet.count >= ENOUGH:
+        if quiet.count >= ENOUGH_FRAMES:
             break
     return prepare_calibrated_tracker(calibration, quiet.untouched, quiet.noise, settings, tell)
 
@@ -135,7 +135,7 @@ def pad_errors(force: Float[np.ndarray, "*n pads"], error: Float[np.ndarray, "*n
 
 
 class ContactTracks:
-    """Follows contacts block by block, and gives back rows of the arrays `ABOUT`, one for each contact of a frame.
+    """Follows contacts block by block, and gives back rows of `TRACK_ARRAYS`, one for each contact of a frame.
 
     Args:
         smooth: each frame is told by later ones too.
@@ -205,7 +205,10 @@ class ContactTracks:
     def _rows(self, found: Iterable[TimedTracks]) -> Rows:
         found = map(self._by_law, found)
         rows = [_row(time, track) for time, tracks in found for track in self._noted(time, tracks)]
-        return {name: np.array([row[name] for row in rows]).reshape(-1, *about.shape) for name, about in ABOUT.items()}
+        return {
+            name: np.array([row[name] for row in rows]).reshape(-1, *about.shape)
+            for name, about in TRACK_ARRAYS.items()
+        }
 
     def _noted(self, time: int, tracks: tuple[Track, ...]) -> Iterator[Track]:
         self._most = max(self._most, len(tracks))
@@ -235,7 +238,7 @@ class About(NamedTuple):
     dtype: str = "f8"
 
 
-ABOUT = {
+TRACK_ARRAYS = {
     "time": About((), "ns", "of the frame, since time_epoch_utc", "i8"),
     "number": About((), "1", "of the contact, which it keeps while it lives", "i8"),
     "position": About((2,), "m", "in the sheet's flat coordinates; of an edge, its middle"),

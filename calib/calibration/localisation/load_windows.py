@@ -188,11 +188,11 @@ def _found(
 
 def _arrays(windows: list[Window], found: list[Found]) -> dict[str, tuple[Any, str, str]]:
     rows = [dict(_row(window, *one)) for window, one in zip(windows, found, strict=True)]
-    columns = {name: np.stack([row[name] for row in rows]) for name in ABOUT}
-    return {name: (columns[name], *about) for name, about in ABOUT.items()}
+    columns = {name: np.stack([row[name] for row in rows]) for name in LOAD_ARRAYS}
+    return {name: (columns[name], *about) for name, about in LOAD_ARRAYS.items()}
 
 
-ABOUT = {
+LOAD_ARRAYS = {
     "time": ("ns", "begin and end of each window, since time_epoch_utc"),
     "probability": ("1", "of none, one, two, an edge and more"),
     "misfit": ("1", "chi-square over the number of readings of the most probable kind; about 1 or less; NaN: none"),

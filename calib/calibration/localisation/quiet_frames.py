@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 MIN_QUIET = 8  # frames without contact, fewer do not tell the noise
-ENOUGH = 2048  # frames, more tell no more
+ENOUGH_FRAMES = 2048  # frames, more tell no more
 
 
 class QuietFrames:

@@ -13,7 +13,7 @@ from ...fitting.logs import LogPrediction
 RELATIVE_FROM = 0.1
 # RMSE over the standard deviation of the force: from here on the mean force would be as good a guess as the sensor.
 USELESS = 0.9
-THIRDS = ("low", "middle", "high")
+LOG_THIRDS = ("low", "middle", "high")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ class LogEvaluation:
     def _coverage(self, rows: np.ndarray) -> dict[str, float]:
         inside = ((self.force >= self.low) & (self.force <= self.high))[rows]
         third = thirds(self.force[rows])
-        each = {f"coverage_{name}": _mean(inside[third == k]) for k, name in enumerate(THIRDS)}
+        each = {f"coverage_{name}": _mean(inside[third == k]) for k, name in enumerate(LOG_THIRDS)}
         return {"coverage": _mean(inside), **each}
 
     def attributes(self) -> dict[str, str]:
@@ -150,7 +150,7 @@ def _mean(values: np.ndarray) -> float:
 def render_evaluation(evaluation: LogEvaluation, title: str = "") -> str:
     """The results as lines for a terminal."""
     s = evaluation.summary()
-    each = ", ".join(f"{name} {_percent(s[f'coverage_{name}'])}" for name in THIRDS)
+    each = ", ".join(f"{name} {_percent(s[f'coverage_{name}'])}" for name in LOG_THIRDS)
     relative = (
         f" = {s['force_rmse_percent_full_scale']:.1f} % of the largest force, MAPE {s['force_mape']:.1f} % "
         f"(forces above {RELATIVE_FROM:.0%} of the largest)"

@@ -38,7 +38,7 @@ from ...presses.channel_faults import MIN_ARRAY_CHANNELS, faults
 from ...presses.streams import resample
 from ...session import Session, SessionError, Stream, write_archive
 from ...session.given import call_on, require_session, sessions_of
-from ..fitted_sessions import FITTED, is_fitted, require_each_once
+from ..fitted_sessions import FITTED_NOTE, is_fitted, require_each_once
 from ..recipe import Recipe, recipe_or_default
 from ..recipe_text import AUTO_CURVES, SWITCHES
 from .calibration import LogCalibration
@@ -306,7 +306,7 @@ def evaluate_log(calibration: LogCalibration, session: Session, *, ignore_errors
     nearest = np.clip(np.searchsorted(signal.time, force.time), 0, len(signal.time) - 1)
     at_force = LogPrediction(predicted, error, low, high, found.valid[nearest] & np.isfinite(predicted))
     recorded = force.read()[:, 0]
-    fitted = FITTED if is_fitted(calibration.provenance, session) else ""
+    fitted = FITTED_NOTE if is_fitted(calibration.provenance, session) else ""
     notes = tuple(filter(None, [fitted, *ignored, calibration.unseen(recorded)]))
     return log_evaluation(session.name, force.time, recorded, at_force, notes)
 

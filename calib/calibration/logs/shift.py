@@ -15,9 +15,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ...fitting.gain_update import DETERMINED, GainDrift
+from ...fitting.gain_update import DETERMINED_RATIO, GainDrift
 from ...fitting.logs import LogModel, LogPrediction
-from ..recalibration.changes import LARGE_MISFIT, NOTICEABLE, SIGNIFICANT, Advice, days_between, health_line
+from ..recalibration.changes import (
+    LARGE_MISFIT,
+    NOTICEABLE_CHANGE,
+    SIGNIFICANT_RATIO,
+    Advice,
+    days_between,
+    health_line,
+)
 
 MIN_BLOCKS = 5  # of time, with which a standard error over them means something
 MIN_GAIN = 0.1  # of what the sensor read before; a sensor below it does not follow the force, or has another unit
@@ -73,12 +80,12 @@ class LogShift:
             return Advice.UNKNOWN_LOG
         if not self.follows:
             return Advice.CALIBRATE_LOG
-        if self.misfit > LARGE_MISFIT and not self.scatter <= NOTICEABLE * self.full_scale:  # NaN: early files
+        if self.misfit > LARGE_MISFIT and not self.scatter <= NOTICEABLE_CHANGE * self.full_scale:  # NaN: early files
             return Advice.CALIBRATE_LOG
         change = np.abs([self.gain / self.before[0] - 1, (self.offset - self.before[1]) / self.full_scale])
         errors = np.array([self.errors[0] / self.before[0], self.errors[1] / self.full_scale])
-        moved = change > NOTICEABLE
-        if (moved & (change > SIGNIFICANT * errors)).any():
+        moved = change > NOTICEABLE_CHANGE
+        if (moved & (change > SIGNIFICANT_RATIO * errors)).any():
             return Advice.RECALIBRATE
         return Advice.UNSURE if moved.any() else Advice.KEEP
 
@@ -210,7 +217,7 @@ def fit_shift(
     gain, offset = mean + found * unit
     remains = read - gain * force - offset
     misfit, scatter = (float(np.sqrt(np.mean(size**2))) for size in (remains / deviation, remains))
-    determined = bool(posterior[0, 0] < DETERMINED**2 * covariance[0, 0])
+    determined = bool(posterior[0, 0] < DETERMINED_RATIO**2 * covariance[0, 0])
     return ShiftFit(np.array([gain, offset]), (posterior + posterior.T) / 2, determined, misfit, scatter)
 
 

@@ -14,8 +14,9 @@ import numpy as np
 from ...fitting.gain_update import relative
 from ...fitting.pad_gains import PadGains
 
-NOTICEABLE = 0.02  # change of a gain below which a recalibration is not worth it
-SIGNIFICANT = 3.0  # standard errors: the largest move of several pads is looked at, and while live again and again
+NOTICEABLE_CHANGE = 0.02  # change of a gain below which a recalibration is not worth it
+# Of a change over its standard error: the largest move of several pads is looked at, and while live again and again.
+SIGNIFICANT_RATIO = 3.0
 LARGE_MISFIT = 2.0  # residuals over the stated ones: a gain does not explain the readings
 
 
@@ -118,7 +119,7 @@ class Recalibration:
     def significant(self) -> np.ndarray:
         """Whether each gain moved noticeably and by more than its error allows, (pads,)."""
         size = np.abs(self.change)
-        return np.asarray(self.determined & (size > NOTICEABLE) & (size > SIGNIFICANT * self.change_error))
+        return np.asarray(self.determined & (size > NOTICEABLE_CHANGE) & (size > SIGNIFICANT_RATIO * self.change_error))
 
     @property
     def days(self) -> float:
@@ -130,11 +131,11 @@ class Recalibration:
         """What to do about the calibration as it was before this recalibration."""
         if not self.determined.any():
             return Advice.UNKNOWN
-        if self.misfit > LARGE_MISFIT and not self.scatter <= NOTICEABLE:  # NaN: files of an early version
+        if self.misfit > LARGE_MISFIT and not self.scatter <= NOTICEABLE_CHANGE:  # NaN: files of an early version
             return Advice.CALIBRATE
         if self.significant.any():
             return Advice.RECALIBRATE
-        return Advice.UNSURE if (np.abs(self.change) > NOTICEABLE)[self.determined].any() else Advice.KEEP
+        return Advice.UNSURE if (np.abs(self.change) > NOTICEABLE_CHANGE)[self.determined].any() else Advice.KEEP
 
     @property
     def health(self) -> str:

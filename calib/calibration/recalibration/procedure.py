@@ -29,7 +29,7 @@ from ...session import Session, SessionError
 from ...session.given import require_session
 from ..calibration import Calibration
 from ..fitted_sessions import require_not_moved_by
-from ..force_maps import USED, ForceModel, force_model, unmoved_forces
+from ..force_maps import USED_PARTS, ForceModel, force_model, unmoved_forces
 from ..given import require_calibration
 from ..localisation.press_images import Imager
 from ..logs.calibration import LogCalibration
@@ -171,7 +171,7 @@ class OrdinaryUse(AbstractEvidence):
 
     def read(self, calibration: Calibration, session: Session, ignore_errors: bool) -> tuple[LoadedPads, list[str]]:
         require_skin(session, calibration.skin, {name: session.stream(name) for name in ("eit", "pressure")})
-        notes = list(accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED))
+        notes = list(accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED_PARTS))
         return use_loads(calibration, session), notes
 
     def update(self, calibration: Calibration, loads: LoadedPads, noise: PressNoise) -> GainUpdate:
@@ -489,4 +489,4 @@ def estimator_of(calibration: Calibration) -> str:
 def _parts(session: Session) -> tuple[str, ...]:
     """Parts of a session whose errors count: without a table of presses and a stage no place is claimed."""
     placed = session.presses is not None or "stage" in session.streams
-    return ("",) if placed else (*USED, "/streams/force")
+    return ("",) if placed else (*USED_PARTS, "/streams/force")

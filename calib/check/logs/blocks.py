@@ -14,8 +14,8 @@ from ..streams.statistics import StreamStatistics
 
 NOT_SIGNALS = ("force", "stage", "temperature", "barometer")
 MAX_CELLS, MAX_ROWS = 1 << 26, 1 << 15  # values that are read, and samples that are compared
-BLOCKS, MIN_BLOCK = 12, 20  # blocks of a log; samples in a block, from which their relation shows
-SPREAD = (5, 95)  # percentiles: what lies beyond may be spikes
+LOG_BLOCKS, MIN_BLOCK = 12, 20  # blocks of a log; samples in a block, from which their relation shows
+SPREAD_PERCENTILES = (5, 95)  # percentiles: what lies beyond may be spikes
 
 
 def signal_name(streams: Collection[str]) -> str:
@@ -48,7 +48,7 @@ class LogBlocks:
     @cached_property
     def rows(self) -> list[np.ndarray]:
         """Rows of each block."""
-        return np.array_split(np.arange(len(self.time)), BLOCKS)
+        return np.array_split(np.arange(len(self.time)), LOG_BLOCKS)
 
     @cached_property
     def starts(self) -> np.ndarray:
@@ -79,12 +79,12 @@ def log_blocks(statistics: Mapping[str, StreamStatistics]) -> LogBlocks | None:
     if not name or "force" not in statistics:
         return None
     force, signal = statistics["force"].stream, statistics[name].stream
-    if len(signal) * signal.channels > MAX_CELLS or len(force) < BLOCKS * MIN_BLOCK:
+    if len(signal) * signal.channels > MAX_CELLS or len(force) < LOG_BLOCKS * MIN_BLOCK:
         return None
     time, known, values = _together(force, signal)
     column = np.flatnonzero(~statistics[name].dead)
     good = np.isfinite(known) & np.isfinite(values[:, column]).all(1)
-    if not len(column) or good.sum() < BLOCKS * MIN_BLOCK:
+    if not len(column) or good.sum() < LOG_BLOCKS * MIN_BLOCK:
         return None
     rows = np.flatnonzero(good)
     rows = rows[:: -(-len(rows) // MAX_ROWS)]
@@ -100,7 +100,7 @@ def _together(force: Stream, signal: Stream) -> tuple[np.ndarray, np.ndarray, np
 
 def spread(values: np.ndarray) -> float:
     """Range of most of the values."""
-    low, high = np.percentile(values, SPREAD)
+    low, high = np.percentile(values, SPREAD_PERCENTILES)
     return float(high - low)
 
 

@@ -8,11 +8,11 @@ from scipy import signal
 from ...presses.channel_faults import MIN_ARRAY_CHANNELS, rank_correlation
 from ...presses.streams import true_runs
 from ..report import Finding, Severity
-from .blocks import SPREAD, LogBlocks, usual
+from .blocks import SPREAD_PERCENTILES, LogBlocks, usual
 
 NO_RELATION = 0.2  # correlation, in the whole log and in its blocks, below which a channel tells nothing of the force
 LAGGED = 0.3  # the same where the channel may come early or late by up to a quarter of the log
-RELATED = 0.6  # rank correlation in a block in which a channel follows the force
+RELATED_CORRELATION = 0.6  # rank correlation in a block in which a channel follows the force
 CHANGES = 3.0  # times the noise: what varies more is no noise
 STILL, GOES_ON = 0.02, 0.7  # of the usual spread: of a stream that stands still, and of one that goes on
 MIN_STILL = 2  # blocks in turn
@@ -48,7 +48,7 @@ def _lagged(a: np.ndarray, b: np.ndarray) -> float:
 
 def standstill_findings(log: LogBlocks) -> Iterator[Finding]:
     """The force stands still while the channels go on (a load cell that was unplugged), or the channels do."""
-    unrelated = (np.abs(log.correlations) < RELATED).all(0)
+    unrelated = (np.abs(log.correlations) < RELATED_CORRELATION).all(0)
     best = int(np.median(np.abs(log.correlations), axis=1).argmax())
     for rows in _standstills(log, unrelated & _still(log.force_spread)):
         if goes_on(log.values[rows, best], log.spreads[best]):
@@ -75,7 +75,7 @@ def _standstills(log: LogBlocks, flag: np.ndarray) -> list[slice]:
 
 def goes_on(part: np.ndarray, spreads: np.ndarray) -> bool:
     """Whether values of a part go up and down as they usually do: creep and the filling of a pad go one way."""
-    low, high = np.percentile(part, SPREAD)
+    low, high = np.percentile(part, SPREAD_PERCENTILES)
     if not _changes(part) or high - low < GOES_ON * usual(spreads):
         return False
     quarter = (high - low) / 4

@@ -11,8 +11,8 @@ import numpy as np
 
 from ..parts import Part, flagged_part, stepped_part
 from ..report import Finding, Severity
-from .blocks import BLOCKS, LogBlocks, usual
-from .following import RELATED, goes_on
+from .blocks import LOG_BLOCKS, LogBlocks, usual
+from .following import RELATED_CORRELATION, goes_on
 
 MIN_RATIO = 4.0  # of a change of gain: friction, creep and wear change it by less
 MIN_STEP_SCATTERS = 5.0  # of the gains of the blocks in both parts
@@ -56,7 +56,7 @@ def _agreeing(changes: list[_Change]) -> list[_Change]:
     if not changes:
         return []
     ratios, begins = np.array([(change.ratio, change.times[change.part.row]) for change in changes]).T
-    near = np.abs(begins - np.median(begins)) <= np.ptp(changes[0].times) / (BLOCKS - 2)
+    near = np.abs(begins - np.median(begins)) <= np.ptp(changes[0].times) / (LOG_BLOCKS - 2)
     usual_ratio = float(np.median(ratios))
     near &= (ratios / usual_ratio > 1 / MIN_RATIO) & (ratios / usual_ratio < MIN_RATIO)
     return [change for change, is_near in zip(changes, near, strict=True) if is_near]
@@ -73,7 +73,7 @@ def _finding(log: LogBlocks, change: _Change, subject: str, where: str, severity
 
 def _related(log: LogBlocks, channel: int) -> np.ndarray:
     """Flags (blocks,) of those in which a channel follows the force; none of a channel that often does not."""
-    used = np.abs(log.correlations[channel]) >= RELATED
+    used = np.abs(log.correlations[channel]) >= RELATED_CORRELATION
     loaded = log.force_spread > NORMAL * usual(log.force_spread)
     enough = used.sum() >= MIN_COMPARED and used[loaded].mean() >= MIN_SHARE
     return used if enough else np.zeros(len(used), bool)

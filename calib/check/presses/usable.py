@@ -10,7 +10,7 @@ from ..report import Finding, PressSummary, Severity
 from ..streams.statistics import StreamStatistics
 from .force import is_negative, negative_force
 
-NAMES = ("eit", "pressure", "force")  # streams that every press needs samples of
+NEEDED_STREAMS = ("eit", "pressure", "force")  # streams that every press needs samples of
 
 
 def list_presses(
@@ -54,7 +54,7 @@ def press_evidence(
     if presses is None or not len(presses):
         return None
     streams = {name: s.stream for name, s in statistics.items()}
-    needed = [streams[name] for name in NAMES if name in streams]
+    needed = [streams[name] for name in NEEDED_STREAMS if name in streams]
     if not needed:
         return None
     before = presses.accepted.sum()

@@ -12,11 +12,11 @@ from ..evidence import PressEvidence
 from ..report import Finding, Severity
 from .statistics import StreamStatistics
 
-COMPARED = ("eit", "pressure")  # streams that rise with the force
+COMPARED_STREAMS = ("eit", "pressure")  # streams that rise with the force
 CLOCKS_DISAGREE = "the clocks disagree: align the streams before the calibration"
 ALLOWED_SHIFT = 0.3  # of the ramp, beyond which a shift of the whole rise is no property of the skin
 MIN_ALLOWED_SHIFT = 0.05  # s
-SPREADS = 2.0  # of the delays over the presses: a clock is late by the same time in all of them
+DELAY_SPREADS = 2.0  # of the delays over the presses: a clock is late by the same time in all of them
 GRID_STEP, MAX_GRID = 0.05, 2**18  # s and samples of the time axis on which streams are correlated
 SLOW = 30.0  # s: what is slower is drift
 MAX_LAG = 60.0  # s
@@ -37,7 +37,7 @@ def compare_clocks(
     if force is None or evidence.force is None or force.dead.all():
         return ()
     presses, windows = evidence.compared()
-    moving = [name for name in COMPARED if name in statistics and not statistics[name].dead.all()]
+    moving = [name for name in COMPARED_STREAMS if name in statistics and not statistics[name].dead.all()]
     streams = {name: statistics[name].stream for name in moving}
     onsets = onset_delays(force.stream, streams.values(), presses, windows)
     ramp = float(np.median(presses.t_hold0 - presses.t_press)) / SECOND
@@ -55,7 +55,7 @@ def _clock_text(
     """How the clock of a stream disagrees with that of the force; empty if it does not."""
     if len(force.time) < 2 or len(stats.time) < 2 or not force.finite.any():
         return ""
-    late = onset.presses and abs(onset.shift) > max(allowed, SPREADS * onset.spread)
+    late = onset.presses and abs(onset.shift) > max(allowed, DELAY_SPREADS * onset.spread)
     whole = _lag(force, stats, -np.inf, np.inf)
     # A tip that slides changes the readings late, and their activity with the force.
     late = late and (onset.shift < ramp / 2 or abs(whole.seconds - onset.delay) < 2 * allowed)

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..report import Finding, Severity
 from .statistics import StreamStatistics
-from .stuck import EXAMINED
+from .stuck import EXAMINED_VARIABLES
 
 MIN_FRAMES = 5  # with the value
 TIMES_AWAY = 10  # from both neighbours, over what the neighbours differ by and a usual step of the stream
@@ -20,7 +20,7 @@ def dropout_findings(stats: StreamStatistics) -> Iterator[Finding]:
     """Single frames, or single values of a column of pressures, of one and the same value, far from those before and
     after, which are alike."""
     row = stats.row
-    if row.variable not in EXAMINED:
+    if row.variable not in EXAMINED_VARIABLES:
         return
     frames = _away(stats.fingerprint)
     held = [stats.stream.read(int(k), int(k) + 1)[0] for k in frames[:READ]]

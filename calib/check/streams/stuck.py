@@ -9,7 +9,7 @@ from ...session.units import SECOND
 from ..report import Finding, Severity
 from .statistics import MAX_COPIED_FRAMES, MIN_FRAME_CHANNELS, StreamStatistics
 
-EXAMINED = ("force", "pressure", "voltage", "counts")  # a stage or a thermometer may stand still
+EXAMINED_VARIABLES = ("force", "pressure", "voltage", "counts")  # a stage or a thermometer may stand still
 MAX_EQUAL = 0.3  # of the frames beside the run: above it the noise is less than a step of the converter
 CHANCE = 1e-9  # that a run as long comes from noise
 MIN_FRAMES, MIN_SECONDS = 20, 0.3  # of a run
@@ -27,7 +27,7 @@ def stuck_findings(stats: StreamStatistics) -> Iterator[Finding]:
     have driven it there.
     """
     row = stats.row
-    if row.variable not in EXAMINED:
+    if row.variable not in EXAMINED_VARIABLES:
         return
     held = np.diff(stats.fingerprint, prepend=np.nan) == 0
     if row.variable == "voltage" and row.channels >= MIN_FRAME_CHANNELS and held.mean() > MAX_COPIED_FRAMES:

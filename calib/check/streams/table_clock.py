@@ -11,11 +11,11 @@ from ..evidence import PressEvidence
 from ..report import Finding, Severity
 from .clocks import (
     ALLOWED_SHIFT,
+    DELAY_SPREADS,
     MIN_ALLOWED_SHIFT,
     MIN_CHANGE_SHARE,
     MIN_CORRELATION,
     MIN_GAIN,
-    SPREADS,
     beside,
     stream_lag,
 )
@@ -38,7 +38,11 @@ def table_clock_finding(force: StreamStatistics, evidence: PressEvidence) -> Fin
     lag, clear = _table_lag(force, table)
     # A second contact raises the force again: only what the whole rise shares is a matter of clocks.
     begun = _ramp_share(force, windows) > MIN_RAMP_SHARE
-    late = onset.presses and abs(onset.shift) > max(allowed, SPREADS * onset.spread) and not (onset.shift > 0 and begun)
+    late = (
+        onset.presses
+        and abs(onset.shift) > max(allowed, DELAY_SPREADS * onset.spread)
+        and not (onset.shift > 0 and begun)
+    )
     length = float(np.median(presses.t_release - presses.t_press)) / SECOND
     clear = clear and abs(lag) > allowed and not (0 < lag < length and begun)
     if late or clear:

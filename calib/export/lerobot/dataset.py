@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxeit.notebook import png_of
 
-from ...calibration.application import FORMAT
+from ...calibration.application import FORCE_MAP_FORMAT
 from ...calibration.frame_blocks import Progress
 from ...session import ArchiveReader, open_archive
 from ...session.errors import problem
@@ -154,7 +154,7 @@ def rounded_up(value: float) -> float:
 
 def _skin_of(path: Path) -> _Source:
     """What a force map says; raises `SessionError` for a file that is none, or without frames."""
-    with open_archive(path, FORMAT) as archive:
+    with open_archive(path, FORCE_MAP_FORMAT) as archive:
         rows, columns = (archive.attrs.get(name) for name in ("image_rows", "image_columns"))
         names = ("time", "force", "pad_force", "pad_valid", "pad_names")
         missing = next((name for name in names if name not in archive.arrays), "")
@@ -198,7 +198,7 @@ def _write_frames(
     first = 0
     with FrameFiles(folder, features) as files:
         for number, source in enumerate(progress(sources)):
-            with open_archive(source, FORMAT) as archive:
+            with open_archive(source, FORCE_MAP_FORMAT) as archive:
                 times = archive.arrays["time"].read()
                 rows = held_rows(times, fps)
                 stats = {name: FeatureStats(len(rows), channels=name == IMAGE) for name in features}

@@ -17,7 +17,7 @@ from .location import LogLocation
 from .noise import LogNoise
 
 # Part of the range of a channel by which a reading may lie outside it; as for the pressure of a curve.
-TOLERANCE = 0.05
+RANGE_MARGIN = 0.05
 # Part of the range of the fitted signal below which a sensor counts as at rest.
 REST = 0.1
 
@@ -150,9 +150,9 @@ def with_noise(
 
 
 def within(reach: Float[np.ndarray, "2 channels"], values: Float[np.ndarray, "n channels"]) -> np.ndarray:
-    """Flags (n,) of the rows whose channels all lie within their ranges, or less than `TOLERANCE` of it outside."""
+    """Flags (n,) of the rows whose channels all lie within their ranges, or less than `RANGE_MARGIN` of it outside."""
     low, high = reach
-    margin = TOLERANCE * (high - low)
+    margin = RANGE_MARGIN * (high - low)
     return np.asarray(((values >= low - margin) & (values <= high + margin)).all(1))
 
 

@@ -10,7 +10,7 @@ from ..intervals import COVERAGE, MIN_GROUPS, NORMAL_MULTIPLE, most_likely_sizes
 STRETCHES = 0.75  # share of the stretches of time in which the interval covers the readings
 # s before and after a sample, over which the rate of its force is taken. It is as long as the lags of sensors are: a
 # longer one spreads the error of a sudden change over readings that do not have it.
-WINDOW = 0.05
+RATE_WINDOW = 0.05
 
 
 class LogNoise(eqx.Module):
@@ -89,12 +89,12 @@ def _multiple(pull: Float[np.ndarray, " n"], group: np.ndarray) -> float:
 
 
 def force_rate(time: np.ndarray, force: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Rate of a force (N) at times (ns), N/s, from `WINDOW` before to `WINDOW` after; NaN where the force is."""
+    """Rate of a force (N) at times (ns), N/s, over `RATE_WINDOW` before and after; NaN where the force is."""
     known = np.isfinite(force)
     if known.sum() < 2:
         return np.where(known, 0.0, np.nan)
     at, of, seconds = time[known] / 1e9, force[known], time / 1e9
-    before, after = (np.clip(seconds + side * WINDOW, at[0], at[-1]) for side in (-1, 1))
+    before, after = (np.clip(seconds + side * RATE_WINDOW, at[0], at[-1]) for side in (-1, 1))
     rate = (np.interp(after, at, of) - np.interp(before, at, of)) / np.maximum(after - before, 1e-9)
     return np.where(known, rate, np.nan)
 

@@ -30,7 +30,7 @@ from .combination import AbstractCombination, one_channel
 from .directions import cycles_of, travel_of
 from .gaussian_process import SmoothChannels
 from .location import LogLocation, box_of, fit_gains, inside, ratios, relative
-from .model import TOLERANCE, LogModel, LogPrediction, curve_forces, reach_of, signals_for, with_noise, within
+from .model import RANGE_MARGIN, LogModel, LogPrediction, curve_forces, reach_of, signals_for, with_noise, within
 from .noise import fit_log_noise
 from .series import LogSeries
 
@@ -248,7 +248,7 @@ def _copy(fits: _Fits, row: int, rows: np.ndarray, found: HeldOut) -> None:
 def _in_range(curves: FittedCurve, signals: np.ndarray) -> np.ndarray:
     """Flags (fits, n) of the signals within the range of each fit."""
     low, high = np.asarray(curves.pressure_range).T[:, :, None]
-    margin = TOLERANCE * (high - low)
+    margin = RANGE_MARGIN * (high - low)
     return np.asarray((signals >= low - margin) & (signals <= high + margin))
 
 

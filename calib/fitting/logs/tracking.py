@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..curves.play_operators import remembered
 from .model import LogModel, LogPrediction, median_of_three, with_noise
-from .noise import WINDOW
+from .noise import RATE_WINDOW
 
 
 class _Reading(NamedTuple):
@@ -50,7 +50,7 @@ class LogTracker:
         reading = _Reading(values[None], at, [time, 0.0, 0.0, 0.0])
         self._recent.append(reading.entry)
         self._estimate(self._signals.step(time / 1e9, inputs[0]), reading)
-        while len(self._recent) > 2 and self._recent[1][0] <= time - 1e9 * WINDOW:
+        while len(self._recent) > 2 and self._recent[1][0] <= time - 1e9 * RATE_WINDOW:
             self._recent.popleft()
         when, force, error, valid = (np.array(column) for column in zip(*self._recent, strict=True))
         found = with_noise(self._model.noise, when, force, error, valid > 0)

@@ -21,7 +21,7 @@ from .messages import (
     PARTIAL,
     PONG,
     VALUE_TYPES,
-    VERSION,
+    WIRE_VERSION,
     Frame,
     Layout,
     Layouts,
@@ -142,7 +142,7 @@ def _parse_packet(layouts: Layouts, packet: bytes) -> Parsed:
         return None, DecoderCounts(checksum=1)
     kind, stream = body[0], body[1]
     dtype = VALUE_TYPES.get(kind & ~(LONG_TICKS | PARTIAL) & 0x0F)
-    if kind not in (NOTE, PONG) and (kind >> 4 != VERSION or dtype is None):
+    if kind not in (NOTE, PONG) and (kind >> 4 != WIRE_VERSION or dtype is None):
         return None, DecoderCounts(version=1)
     if stream not in layouts:
         return None, DecoderCounts(other=1)

@@ -19,7 +19,7 @@ from .messages import (
     PONG,
     READ,
     VALUE_TYPES,
-    VERSION,
+    WIRE_VERSION,
     WireError,
 )
 
@@ -37,7 +37,7 @@ def encode_frame(stream: int, seq: SupportsInt, ticks: SupportsInt, values: np.n
     if not kinds or values.ndim != 1 or not 1 <= len(values) <= MAX_CHANNELS or bits not in HEADS:
         what = f"values of {values.dtype} and shape {values.shape}, ticks of {bits} bits"
         raise WireError(f"frame: {what}; give f4 or i2, one row, 32 or 64 bits")
-    kind = VERSION << 4 | (LONG_TICKS if bits == 64 else 0) | kinds[0]
+    kind = WIRE_VERSION << 4 | (LONG_TICKS if bits == 64 else 0) | kinds[0]
     head = HEADS[bits].pack(kind, stream, int(seq) % 2**32, int(ticks) % 2**bits)
     return seal(head + values.astype(VALUE_TYPES[kinds[0]]).tobytes())
 
@@ -98,7 +98,7 @@ def select_readings(packet: bytes, readings: np.ndarray) -> bytes:
     """Reduce a frame to some `readings`, as a device does on request. A message that is no frame stays as it is."""
     body = cobs_decode(packet[:-1]) or b"\xff"
     dtype = VALUE_TYPES.get(body[0] & ~LONG_TICKS & 0x0F)
-    if body[0] >> 4 != VERSION or dtype is None:
+    if body[0] >> 4 != WIRE_VERSION or dtype is None:
         return packet
     head = HEADS[64 if body[0] & LONG_TICKS else 32].size
     values = np.frombuffer(body[head:-2], dtype)

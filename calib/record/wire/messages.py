@@ -11,13 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-VERSION = 1
+WIRE_VERSION = 1
 MAX_CHANNELS = 16_000
 MAX_FRAME_BYTES = 1 << 16  # of a frame of that many channels, as sent
 HEADS = {32: struct.Struct("<BBII"), 64: struct.Struct("<BBIQ")}  # by bits of ticks: kind, stream, seq, ticks
 VALUE_TYPES: dict[int, np.dtype] = {0: np.dtype("<f4"), 1: np.dtype("<i2")}
 LONG_TICKS, PARTIAL = 2, 4  # bits of the kind of a frame: ticks of 64 bits; only some readings
-NOTE, READ, PING, PONG = (VERSION << 4 | kind for kind in (8, 9, 10, 11))  # kinds of messages that are no frames
+NOTE, READ, PING, PONG = (WIRE_VERSION << 4 | kind for kind in (8, 9, 10, 11))  # kinds of messages that are no frames
 ECHO = struct.Struct("<qQ")  # host ns of a ping, ticks of the device
 
 

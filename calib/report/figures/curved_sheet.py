@@ -10,7 +10,7 @@ import jaxeit as je
 
 from ...calibration.calibration import Calibration
 from ...calibration.force_maps import force_map
-from .panels import HEIGHT, WIDTH, Panel, panel, panel_figure
+from .panels import CHART_HEIGHT, PANEL_WIDTH, Panel, panel, panel_figure
 from .parts import GREEN, GREY, MM, RED, cell_edges, colour_reach, new_figure
 
 try:  # an extra, as in `figures`
@@ -55,7 +55,7 @@ def curved_panels(calibration: Calibration, estimator: str) -> list[Panel]:
 
 
 def _view_panel(calibration: Calibration, view: Callable[[Any], Any], label: str, name: str) -> Panel:
-    figure, beside = panel_figure(WIDTH, HEIGHT, calibration.simulated), 0.8
+    figure, beside = panel_figure(PANEL_WIDTH, CHART_HEIGHT, calibration.simulated), 0.8
     axes = figure.add_axes((0.0, 0.0, beside if label else 1.0, 0.95), **PROJECTION)
     drawn = view(axes)
     _sheet(axes, calibration.skin)

@@ -7,7 +7,7 @@ import numpy as np
 from ...calibration.logs.evaluation import LogEvaluation
 from ...fitting.fields import FittedField
 from .pads import pad_gain, symmetric_limit
-from .panels import WIDER, WIDTH, Panel, chart_axes, panel
+from .panels import PANEL_WIDTH, WIDE_PANEL_WIDTH, Panel, chart_axes, panel
 from .parts import BLUE, GREY, MM, RED, bare_figure, cell_edges
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ def _rows(found: LogEvaluation, rows: np.ndarray) -> np.ndarray:
 
 
 def _axes(height: float, x: str, y: str) -> tuple["Figure", Any]:
-    figure, axes = chart_axes(width=WIDER, height=height)
+    figure, axes = chart_axes(width=WIDE_PANEL_WIDTH, height=height)
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     axes.grid(alpha=0.3)
@@ -88,7 +88,7 @@ def place_panels(gain: FittedField, box: np.ndarray) -> list[Panel]:
 def _place_panel(
     x: np.ndarray, y: np.ndarray, cells: np.ndarray, limits: tuple[float, float], colours: str, label: str
 ) -> Panel:
-    figure = bare_figure(WIDTH, 0.8 * WIDTH, layout="constrained")
+    figure = bare_figure(PANEL_WIDTH, 0.8 * PANEL_WIDTH, layout="constrained")
     axes = figure.add_subplot()
     drawn = axes.pcolormesh(x, y, cells, vmin=limits[0], vmax=limits[1], cmap=colours, rasterized=True)
     figure.colorbar(drawn, ax=axes).set_label(label)

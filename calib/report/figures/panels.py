@@ -19,9 +19,9 @@ from .parts import BLUE, GREEN, MARKS, MM, RED, bare_figure, draw_sheet
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-WIDTH = 3.5  # inches, at which letters of 10 points are as large as those of the page
-WIDER = 5.0  # inches, of panels of which the page has few
-HEIGHT = 2.6  # inches, of a panel that shows no sheet
+PANEL_WIDTH = 3.5  # inches, at which letters of 10 points are as large as those of the page
+WIDE_PANEL_WIDTH = 5.0  # inches, of panels of which the page has few
+CHART_HEIGHT = 2.6  # inches, of a panel that shows no sheet
 LEFT, RIGHT, BAR, BOTTOM, TOP, MARK = 0.72, 0.12, 0.95, 0.5, 0.1, 0.2  # margins, inches: MARK is that of SIMULATED
 SHEET_MARGIN = 0.03  # about the sheet, of its longer side
 TALLEST = 1.6  # height of a sheet over its width, beyond which it is drawn narrower
@@ -64,7 +64,7 @@ def panel(figure: "Figure", axes: Any, name: str, alt: str = "") -> Panel:
 
 
 def sheet_axes(
-    skin: je.Skin, *, bar: bool = False, simulated: bool = False, width: float = WIDTH
+    skin: je.Skin, *, bar: bool = False, simulated: bool = False, width: float = PANEL_WIDTH
 ) -> tuple["Figure", Any, Any]:
     """A figure whose axes have the proportions of the sheet, with its outline and pads; and axes of a colour bar.
 
@@ -89,7 +89,9 @@ def sheet_axes(
     return figure, axes, figure.add_axes((beside, BOTTOM / height, 0.12 / width, up / height)) if bar else None
 
 
-def chart_axes(*, simulated: bool = False, width: float = WIDTH, height: float = HEIGHT) -> tuple["Figure", Any]:
+def chart_axes(
+    *, simulated: bool = False, width: float = PANEL_WIDTH, height: float = CHART_HEIGHT
+) -> tuple["Figure", Any]:
     """A figure with one pair of axes.
 
     Raises:

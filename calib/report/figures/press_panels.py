@@ -12,7 +12,7 @@ from ...calibration.evaluation import Evaluation
 from ...presses.means import dominant_pad
 from .maps import ExampleMaps, draw_contact
 from .pads import curve_panel, loop_panel, pad_gain, pad_maps, residuals_by, symmetric_limit
-from .panels import WIDER, Panel, chart_axes, panel, share_limits, sheet_axes
+from .panels import WIDE_PANEL_WIDTH, Panel, chart_axes, panel, share_limits, sheet_axes
 from .parts import GREEN, MM, RED, colour_reach, draw_pixels, value_map
 from .presses import localisation_panel, sensitivity_maps, sensitivity_title
 
@@ -64,7 +64,7 @@ def localisation_panels(found: Evaluation, skin: je.Skin, *estimators: str, simu
     """True and estimated places, a panel for each estimator, with the numbers of the electrodes."""
     out = []
     for k, estimator in enumerate(estimators):
-        figure, axes, _ = sheet_axes(skin, simulated=simulated, width=WIDER)
+        figure, axes, _ = sheet_axes(skin, simulated=simulated, width=WIDE_PANEL_WIDTH)
         localisation_panel(axes, found, skin, estimator)
         number_electrodes(axes, skin)
         out.append(panel(figure, axes, f"places{k}"))
@@ -188,7 +188,7 @@ def gain_panels(calibration: Calibration) -> list[Panel]:
     titles = "Gain by place", "Its standard error, and the places of the presses"
     out = []
     for k, (values, label) in enumerate(((gain, "gain"), (error, "standard error of the gain, %"))):
-        figure, axes, bar = sheet_axes(skin, bar=True, simulated=calibration.simulated, width=WIDER)
+        figure, axes, bar = sheet_axes(skin, bar=True, simulated=calibration.simulated, width=WIDE_PANEL_WIDTH)
         limits = axes.get_xlim(), axes.get_ylim()
         drawn = pad_maps(axes, skin, zip(x, y, values, strict=True), scales[k])
         for cells in drawn:

@@ -30,7 +30,7 @@ from h5py import h5d, h5f, h5fd, h5g, h5p, h5s, h5t
 from jaxeit.files import open_regular
 
 from ..errors import SessionError, printable, problem
-from ..tables import FORMAT
+from ..tables import SESSION_FORMAT
 from .guard import MAX_ATTRIBUTE_BYTES
 
 try:
@@ -88,7 +88,7 @@ def require_no_session(path: Path, *, simulated_too: bool = True, imported_too: 
         return
     with contextlib.suppress(OSError), h5py.File(path) as file:  # of another kind, it is no session
         kind, simulated, creator = (file.attrs.get(name) for name in ("format", "simulated", "creator"))
-        if not isinstance(kind, str | bytes) or kind not in (FORMAT, FORMAT.encode()):
+        if not isinstance(kind, str | bytes) or kind not in (SESSION_FORMAT, SESSION_FORMAT.encode()):
             return
         creator = creator.decode(errors="replace") if isinstance(creator, bytes) else creator
         imported = isinstance(creator, str) and creator.endswith(f" {IMPORT}")

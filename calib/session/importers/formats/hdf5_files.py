@@ -28,7 +28,7 @@ from ...hdf5.storage import (
     writing,
 )
 from ...reader import Session, open_session
-from ...tables import FORMAT, STREAM_EXTRAS
+from ...tables import SESSION_FORMAT, STREAM_EXTRAS
 from ..arrays import AbstractArrayImporter, ArrayShape, known, table_shape
 from ..base import About
 from ..child import in_child
@@ -82,7 +82,7 @@ class Hdf5Importer(AbstractArrayImporter):
         """Copy the session ``path`` to ``folder/path.name``; returns the names of members that were left out."""
         with _opened(path) as file:
             said = file.attrs.get("format", "")
-            if _text(said) != FORMAT:
+            if _text(said) != SESSION_FORMAT:
                 what = "is HDF5 but not a session"
                 raise problem(path, "file", what, "say which arrays are what with --time and --stream")
             with new_file(folder / path.name) as (target, check):
