@@ -27,8 +27,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
 
 # Largest size of an array that `bind` packs with others. Each argument costs a call half a microsecond, and more at its
-# first use; packing copies the array, which for larger arrays costs more memory than the microsecond is worth.
-MAX_PACKED_SIZE = 1 << 16
+# first use; but a program takes packed arrays apart at each call, which for larger ones takes longer.
+MAX_PACKED_SIZE = 1 << 14
 
 
 def verb(function: F) -> F:

@@ -294,7 +294,7 @@ class Tracker:
         """Forces on pads as the programs take them; raises InverseError if an array has another shape."""
         count = self.filter.sheet.pad_area.shape[1]
         if forces is None:
-            return Pads(jnp.zeros(count), jnp.full(count, jnp.inf, float))  # as those that are known: no weak type
+            return Pads(np.zeros(count), np.full(count, np.inf))
         force, error = np.asarray(forces, float), np.asarray(errors, float)
         if force.shape != (count,) or error.shape != (count,):
             raise InverseError(
@@ -303,7 +303,7 @@ class Tracker:
         known = np.isfinite(force) & np.isfinite(error)
         if not (error[known] > 0).all():
             raise InverseError("a pad has the standard error zero; give a number above zero, in newtons")
-        return Pads(jnp.asarray(np.where(known, force, 0)), jnp.asarray(np.where(known, error, np.inf)))
+        return Pads(np.where(known, force, 0), np.where(known, error, np.inf))
 
     def _is_unexpected(self, now: Tracking, update: Update) -> bool:
         if float(update.surprise) >= SURPRISING:

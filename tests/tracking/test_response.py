@@ -11,7 +11,7 @@ from jaxeit.model.bases import Elements
 from jaxeit.model.sensitivity import pair_jacobian
 from jaxeit.tracking import prepare_tracker
 from jaxeit.tracking.belief.reanalysis import prepare_reanalysis
-from jaxeit.tracking.belief.response import load_pressure
+from jaxeit.tracking.belief.response import load_pressure, load_slopes
 from jaxeit.tracking.preparation import squares_to_lines
 from tests.compiled import compiled
 
@@ -189,6 +189,17 @@ def test_single_precision_errs_below_a_tenth_of_the_noise(tracker, exact):
     double = compiled(exact.shown, LOADS, gain, jnp.array([0]), exact.near(LOADS)).readings
     assert single.dtype == double.dtype
     assert jnp.max(jnp.abs(single - double)) < 0.1
+
+
+@pytest.mark.parametrize("half", [(0.0, 0.0), (1e-3, 0.0), (6e-3, 3e-3), (-0.02, 0.03)])
+def test_slopes_of_a_load_by_hand_are_those_of_jax(half):
+    points = jnp.asarray(np.random.default_rng(0).uniform(0.07, 0.13, (200, 2)))
+    load = jnp.array([0.1, 0.1, np.log(0.01), np.log(8.0), *half])
+    value, slopes = load_slopes(load, points)
+    expected = jax.jacfwd(load_pressure)(load, points).T
+    size = jnp.abs(expected).max(1)
+    np.testing.assert_allclose(value, load_pressure(load, points), rtol=1e-12)
+    np.testing.assert_array_less(jnp.abs(slopes - expected).max(1), 1e-9 * size + 1e-300)
 
 
 def test_a_load_on_a_pad_is_felt_by_it(tracker):

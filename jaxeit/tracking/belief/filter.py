@@ -60,8 +60,8 @@ ORDINARY, CAREFUL = _solver(FALL), _solver(CAREFUL_FALL)
 class Pads(NamedTuple):
     """Forces on the pads in a frame, and their standard errors, (pads,) N; infinite for a pad that tells none."""
 
-    force: Float[Array, " pads"]
-    error: Float[Array, " pads"]
+    force: Float[Array | np.ndarray, " pads"]
+    error: Float[Array | np.ndarray, " pads"]
 
 
 class Belief(NamedTuple):

@@ -67,7 +67,7 @@ class Reanalysis(eqx.Module):
         own, before = jnp.where(inside, change, 0), self.potential[unknowns]
         untouched = self._products(self.slopes[elements], self.potential[self.dofs[elements]])
         first, second = self.pairs.T
-        moved = -(before.T @ y)[first, second] + own @ untouched
+        moved = -(before.T @ y)[first, second] + untouched @ own
         products = self._products(self.slopes[elements], after[place])
         return BeyondFirstOrder(moved @ self.mixing, inside, products - untouched)
 
@@ -99,20 +99,20 @@ class Reanalysis(eqx.Module):
         self, directions: Float[Array, "d elements"], potential: Float[Array, "n electrodes"]
     ) -> Float[Array, "d r"]:
         """Derivatives of the readings along changes of all elements, S, where unit currents have these potentials."""
-        return -(directions @ self._products(self.slopes, potential[self.dofs])) @ self.mixing
+        return -(directions @ self._products(self.slopes, potential[self.dofs]).T) @ self.mixing
 
     def _products(
         self, slopes: Float[Array, "e k s"], potential: Float[Array, "e k electrodes"]
-    ) -> Float[Array, "e p"]:
+    ) -> Float[Array, "p e"]:
         """Products of the fields of each pair of electrodes in elements."""
         fields = jnp.einsum("eks,eka->sae", slopes, potential)
         first, second = self.pairs.T
-        return jnp.sum(fields[:, first] * fields[:, second], 0).T
+        return jnp.sum(fields[:, first] * fields[:, second], 0)
 
     def beyond_slopes(self, found: "BeyondFirstOrder", directions: Float[Array, "d e"]) -> Float[Array, "d r"]:
         """Derivatives of the readings of `beyond` with respect to changes of the elements, by the adjoint identity."""
         own = jnp.where(found.inside, directions, 0)
-        return -(own @ found.products) @ self.mixing
+        return -(own @ found.products.T) @ self.mixing
 
 
 class BeyondFirstOrder(NamedTuple):
@@ -122,12 +122,12 @@ class BeyondFirstOrder(NamedTuple):
     |--------------------------------------------------------------------------|-----------|
     | readings                                                                 | (r,)      |
     | inside: whether an element has all its unknowns among those solved anew  | (e,)      |
-    | products: of the fields after the change, for each pair of electrodes, less those before | (e, p) |
+    | products: of the fields after the change, for each pair of electrodes, less those before | (p, e) |
     """
 
     readings: Float[Array, " r"]
     inside: Bool[Array, " e"]
-    products: Float[Array, "e p"]
+    products: Float[Array, "p e"]
 
 
 @full_precision

@@ -5,6 +5,7 @@ first order of the readings is that of an image on a fine mesh, what is beyond i
 the contacts (`reanalysis`). Derivatives follow the same chain by hand, so that an evaluation solves once.
 """
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -13,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import erf
 from jaxtyping import Array, Bool, Float, Int
 
 from ...contacts.loads.pressure import line, line_shapes
@@ -21,7 +23,7 @@ from .reanalysis import Reanalysis
 
 # Least half length, m: an edge of length zero has no direction.
 SHORTEST = 1e-4
-# Of all loads: from points (n, 2) to their pressure (n,) and its slopes (n, a).
+# Of all loads: from points (n, 2) to their pressure (n,) and its slopes (a, n).
 Pressures = Callable[[Array], tuple[Array, Array]]
 # Half lengths, m, and number of directions of the edges whose neighbours are looked up.
 LENGTHS, ANGLES = (0.015, 0.03), 4
@@ -186,7 +188,7 @@ class LoadedSheet(eqx.Module):
         pads, pixels = self._first_order(pressures, gain, modes, near)
         change, slopes = self._changes(pressures, gain, modes, near)
         found = self.sheet.beyond(near.elements, near.unknowns, change)
-        beyond = self.sheet.beyond_slopes(found, slopes.T)
+        beyond = self.sheet.beyond_slopes(found, slopes)
         readings, first = pixels
         exact = contacts.dtype
         force, pad_slopes = pads
@@ -195,26 +197,23 @@ class LoadedSheet(eqx.Module):
             (readings + found.readings).astype(exact),
             force.astype(exact),
             (first + beyond).astype(exact),
-            jnp.concatenate([pad_slopes.T.astype(exact), still]),
+            jnp.concatenate([pad_slopes.astype(exact), still]),
         )
 
     def _first_order(
         self, pressures: Pressures, gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
     ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        """Forces on pads and their slopes (pads, a); readings of the image and their slopes (a, r)."""
+        """Forces on pads and their slopes (a, pads); readings of the image and their slopes (a, r)."""
         pixels, table = near.pixels, self.pixel_modes[near.pixels]
-        pressure, slopes = pressures(self.pixels[pixels])
-        own = near.own_pixels
-        pressure, slopes = jnp.where(own, pressure, 0), jnp.where(own[:, None], slopes, 0)
-        area = self.pad_area[pixels].T
+        pressure, slopes = (jnp.where(near.own_pixels, part, 0) for part in pressures(self.pixels[pixels]))
+        area, response = self.pad_area[pixels], self.pixel_response[pixels]
         relative, along, by_gain = self._conducting(pressure, jnp.exp(table @ gain.astype(table.dtype)))
-        moved = jnp.concatenate([along[:, None] * slopes, by_gain[:, None] * table[:, modes]], 1)
-        response = self.pixel_response[pixels]
-        return (area @ pressure, area @ slopes), (relative @ response, moved.T @ response)
+        moved = jnp.concatenate([along * slopes, by_gain * table[:, modes].T])
+        return (pressure @ area, slopes @ area), (relative @ response, moved @ response)
 
     def _changes(
         self, pressures: Pressures, gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
-    ) -> tuple[Float[Array, " e"], Float[Array, "e a"]]:
+    ) -> tuple[Float[Array, " e"], Float[Array, "a e"]]:
         """Change of conductivity of the elements, S, and its slopes."""
         elements, table = near.elements, self.modes[near.elements]
         points = self.points[elements]
@@ -222,9 +221,9 @@ class LoadedSheet(eqx.Module):
         factor = jnp.exp(table @ gain.astype(table.dtype))
         relative, along, by_gain = self._conducting(pressure.reshape(points.shape[:2]), factor[:, None])
         scale = jnp.where(near.own_elements, self.sigma[elements], 0)
-        by_load = jnp.einsum("eq,eqk->ek", along * self.weights, slopes.reshape(*points.shape[:2], -1))
-        by_mode = (by_gain @ self.weights)[:, None] * table[:, modes]
-        return scale * (relative @ self.weights), scale[:, None] * jnp.concatenate([by_load, by_mode], 1)
+        by_load = jnp.sum(along * self.weights * slopes.reshape(-1, *points.shape[:2]), 2)
+        by_mode = (by_gain @ self.weights) * table[:, modes].T
+        return scale * (relative @ self.weights), scale * jnp.concatenate([by_load, by_mode])
 
     def _conducting(
         self, pressure: Float[Array, "..."], gain: Float[Array, "..."]
@@ -238,18 +237,34 @@ class LoadedSheet(eqx.Module):
 
 def _pressures(
     loads: Float[Array, "K 6"], points: Float[Array, "n 2"], shapes: bool
-) -> tuple[Float[Array, " n"], Float[Array, "n a"]]:
+) -> tuple[Float[Array, " n"], Float[Array, "a n"]]:
     """Pressure of all loads at points, Pa, and its slopes in the six numbers of each, and in its shape if asked for."""
     values, slopes = zip(*(_with_slopes(load, points, shapes) for load in loads), strict=True)
-    return jnp.sum(jnp.stack(values), 0), jnp.concatenate(slopes, 1)
+    return jnp.sum(jnp.stack(values), 0), jnp.concatenate(slopes)
 
 
 def _with_slopes(
     load: Float[Array, "6"], points: Float[Array, "n 2"], shapes: bool
-) -> tuple[Float[Array, " n"], Float[Array, "n a"]]:
-    value, push = jax.linearize(lambda load: load_pressure(load, points), load)
-    slopes: Array = jax.vmap(push, out_axes=1)(jnp.eye(len(load), dtype=load.dtype))
-    return value, jnp.concatenate([slopes, line_shapes(load, points, SHORTEST)], 1) if shapes else slopes
+) -> tuple[Float[Array, " n"], Float[Array, "a n"]]:
+    value, slopes = load_slopes(load, points)
+    return value, jnp.concatenate([slopes, line_shapes(load, points, SHORTEST).T]) if shapes else slopes
+
+
+def load_slopes(load: Float[Array, "6"], points: Float[Array, "n 2"]) -> tuple[Float[Array, " n"], Float[Array, "6 n"]]:
+    """`load_pressure` and its slopes in the numbers of the load, by hand, which takes a third of the time."""
+    width, half = jnp.exp(load[2]), jnp.sqrt(load[4:] @ load[4:] + SHORTEST**2)
+    unit, away = (load[4:] / half)[:, None], points.T - load[:2, None]
+    along = jnp.sum(unit * away, 0)
+    beside, across = away - along * unit, jnp.sum(away**2, 0) - along**2
+    ends, root = (along + half, along - half), math.sqrt(2) * width
+    peak = jnp.exp(load[3] - 0.5 * across / width**2) / (math.sqrt(2 * math.pi) * width * 4 * half)
+    value = peak * (erf(ends[0] / root) - erf(ends[1] / root))
+    first, last = (2 / math.sqrt(math.pi) / root * peak * jnp.exp(-((end / root) ** 2)) for end in ends)
+    by_place = value * beside / width**2 - (first - last) * unit
+    by_width = value * (across / width**2 - 1) - (first * ends[0] - last * ends[1])
+    turned = beside / half
+    by_half = (value * along / width**2 + first - last) * turned + (first + last - value / half) * unit
+    return value, jnp.concatenate([by_place, by_width[None], value[None], by_half])
 
 
 def load_pressure(load: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
