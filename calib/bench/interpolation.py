@@ -10,11 +10,10 @@ grids: Gerstner and Griebel, Computing 71, 2003; on Leja points: Chkifa, Cohen a
 Mathematics 14, 2014).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -25,11 +24,10 @@ MIN_POINTS, MAX_POINTS = 3, 65  # along an axis
 FULL_RANGE_POINTS = 17  # typical number along an axis that spans the full range of a parameter
 LARGEST_DROP = 0.3  # a term below this share of the one before it may be small by accident
 LARGEST_RATIO = 0.9  # of a term to the one before it, so that the sum of all that follow is finite
-SOLVED_TOGETHER = 4  # frames of a batch, which takes two thirds of the time of single ones
 NOISE = 200  # rounding errors of a solve, in units of the last place of the largest reading
 
 Index = tuple[int, ...]
-SolveEach = Callable[[Int[np.ndarray, " points"], Float[np.ndarray, "points d"]], Float[np.ndarray, "points readings"]]
+Solve = Callable[[Float[np.ndarray, "points d"]], Float[np.ndarray, "points readings"]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,20 +143,13 @@ class FrameInterpolant:
         return sums.T
 
 
-def interpolants(
-    boxes: Sequence[ParameterBox], solve: SolveEach, rest: Float[np.ndarray, " readings"], tolerance: float
-) -> list[FrameInterpolant]:
-    """Polynomials over boxes. What they all want next is solved together, because batches take less time.
-
-    Args:
-        solve: frames (points, readings) for the numbers of the boxes (points,) and parameters (points, d).
-    """
-    made = [FrameInterpolant(box, rest, tolerance) for box in boxes]
-    while unfinished := [number for number, one in enumerate(made) if len(one.wanted)]:
-        counts = [len(made[number].wanted) for number in unfinished]
-        frames = solve(np.repeat(unfinished, counts), np.concatenate([made[number].wanted for number in unfinished]))
-        for number, part in zip(unfinished, np.split(frames, np.cumsum(counts)[:-1]), strict=True):
-            made[number].add(part)
+def interpolant(
+    box: ParameterBox, solve: Solve, rest: Float[np.ndarray, " readings"], tolerance: float
+) -> FrameInterpolant:
+    """The polynomial over a box, through frames that ``solve`` makes of parameters."""
+    made = FrameInterpolant(box, rest, tolerance)
+    while len(made.wanted):
+        made.add(solve(made.wanted))
     return made
 
 
@@ -283,21 +274,19 @@ def frame_solver(model: je.Model, diameter: float) -> Callable[[np.ndarray, np.n
 
     Its arguments are the places of the tips (points, contacts, 2) m, their slide (2,) m, and parameters of the sheet
     (points, d): the loads of the tips in N, their progress along the slide, and the temperature in K. ``diameter`` is
-    that of the tips in m.
+    that of the tips in m. Frames are solved one by one: points come few at a time, and batches of so few take no less
+    time on a CPU.
     """
-    batch = je.bind(_frames, model, jnp.asarray(diameter, model.dtype))
+    frame = je.bind(_frame, model, jnp.asarray(diameter, model.dtype))
 
     def solve(places: np.ndarray, slide: np.ndarray, points: np.ndarray) -> np.ndarray:
-        rows = np.arange(-(-len(points) // SOLVED_TOGETHER) * SOLVED_TOGETHER).reshape(-1, SOLVED_TOGETHER)
-        rows = np.minimum(rows, len(points) - 1)  # the last batch is filled up with the last point
         at, way, each = (array.astype(model.dtype) for array in (places, slide, points))
-        return np.concatenate([batch(at[part], way, each[part]) for part in rows])[: len(points)]
+        return np.stack([frame(tips, way, point) for tips, point in zip(at, each, strict=True)])
 
     return solve
 
 
-@partial(jax.vmap, in_axes=(None, None, 0, None, 0))
-def _frames(
+def _frame(
     model: je.Model,
     diameter: Float[Array, ""],
     places: Float[Array, "contacts 2"],

@@ -1,9 +1,13 @@
 """Frames of the presses of a session: which polynomial gives which frame."""
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float, Int
 
-from .interpolation import SOLVED_TOGETHER, FrameInterpolant, SolveEach, enclosing_boxes, interpolants
+from .interpolation import FrameInterpolant, enclosing_boxes, interpolant
+
+SolveEach = Callable[[Int[np.ndarray, " points"], Float[np.ndarray, "points d"]], Float[np.ndarray, "points readings"]]
 
 
 class PressFrames:
@@ -71,13 +75,15 @@ class PressFrames:
         return np.asarray(solved[back.reshape(points.shape[:2]), np.arange(len(self._rest))])
 
     def _polynomial(self, number: int) -> FrameInterpolant:
-        """That of a box. A press is always made with the same others, so that all bits are the same."""
+        """That of a box; those of earlier presses but the last are forgotten."""
         if number not in self._made:
-            group = self._press // SOLVED_TOGETHER == self._press[number] // SOLVED_TOGETHER
-            press, numbers = self._press[group], np.flatnonzero(group).tolist()
-            boxes = [self._boxes[each] for each in numbers]
-            made = interpolants(boxes, lambda box, points: self._solve(press[box], points), self._rest, self._tolerance)
-            self._made = {past: self._made[past] for past in self._made if self._press[past] >= press[0] - 1}
-            self._made |= zip(numbers, made, strict=True)
-            self.solves += sum(one.solves for one in made)
+            press = int(self._press[number])
+
+            def solve(points: Float[np.ndarray, "points d"]) -> Float[np.ndarray, "points readings"]:
+                return self._solve(np.full(len(points), press), points)
+
+            made = interpolant(self._boxes[number], solve, self._rest, self._tolerance)
+            self._made = {past: self._made[past] for past in self._made if self._press[past] >= press - 1}
+            self._made[number] = made
+            self.solves += made.solves
         return self._made[number]

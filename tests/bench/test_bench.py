@@ -29,7 +29,7 @@ from calib.bench import (
     simulation,
     streams,
 )
-from calib.bench.interpolation import ParameterBox, enclosing_boxes, interpolants
+from calib.bench.interpolation import ParameterBox, enclosing_boxes, interpolant
 from calib.bench.motion import loads_at, planned_motion
 from calib.bench.streams import simulated_streams
 
@@ -80,11 +80,6 @@ def test_a_slide_has_a_box_of_its_own():
     assert owner[0] == owner[1] != owner[2] != owner[3]
 
 
-def interpolate(box, exact, rest, tolerance):
-    """The polynomial of one box."""
-    return interpolants([box], lambda _, points: exact(points), rest, tolerance)[0]
-
-
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-9])
 def test_interpolants_keep_their_tolerance(tolerance):
     """Against the function itself, smooth in two numbers with one at rest."""
@@ -94,7 +89,7 @@ def test_interpolants_keep_their_tolerance(tolerance):
 
     box = ParameterBox(np.array([0.0, 5.0, -0.5]), np.array([20.0, 5.0, 1.0]))
     rest = exact(np.zeros((1, 3)))[0]
-    made = interpolate(box, exact, rest, tolerance)
+    made = interpolant(box, exact, rest, tolerance)
     q = box.low + np.random.default_rng(0).random((200, 3)) * (box.high - box.low)
     change = np.abs(exact(q) - rest).max()
     assert np.abs(made(q[:, None]) - exact(q)).max() < 2 * tolerance * change
@@ -121,7 +116,7 @@ def test_interpolants_do_not_underestimate_their_error(kind, variables):
     for _ in range(5):
         exact = kind(rng.uniform(0.2, 1.5, (5, variables)), rng.normal(size=(5, 20)))
         box = ParameterBox(np.zeros(variables), np.ones(variables))
-        made = interpolate(box, exact, np.zeros(20), 1e-4)
+        made = interpolant(box, exact, np.zeros(20), 1e-4)
         q = rng.random((500, variables))
         error, change = np.abs(made(q[:, None]) - exact(q)).max(), np.abs(exact(q)).max()
         assert error < min(made.error, 1e-4 * change)
@@ -136,12 +131,12 @@ def test_noise_of_the_solver_is_not_interpolated():
         exact = 1 + 0.01 * q.prod(1, keepdims=True) * np.ones(20)
         return (exact + rng.uniform(-50, 50, exact.shape) * np.finfo(np.float32).eps).astype(np.float32)
 
-    assert interpolate(box, solve, rest, 1e-4).solves < 40
+    assert interpolant(box, solve, rest, 1e-4).solves < 40
 
 
 def test_a_sheet_at_rest_is_solved_once():
     box = ParameterBox(np.array([0.0, 2.0]), np.array([0.0, 2.0]))
-    made = interpolate(box, lambda q: q + 1, np.zeros(2), 1e-4)
+    made = interpolant(box, lambda q: q + 1, np.zeros(2), 1e-4)
     np.testing.assert_array_equal(made(np.tile(box.low, (3, 2, 1))), [[1, 3]] * 3)
     assert (made.solves, made.error) == (1, 0)
 
