@@ -98,6 +98,7 @@ class ChannelTable:
     |                        | a tenth of the rms reading, if that is larger; NaN without a partner   |      |
     | missing                | fraction of all samples                                                |      |
     | dead, saturated, noisy | flags                                                                  |      |
+    | empty                  | whether noise hides the voltage that the model expects                 |      |
     """
 
     frames: int
@@ -111,6 +112,7 @@ class ChannelTable:
     dead: np.ndarray
     saturated: np.ndarray
     noisy: np.ndarray
+    empty: np.ndarray
     mixing: sp.csr_array | None = None
 
     def __len__(self) -> int:

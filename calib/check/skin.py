@@ -17,6 +17,9 @@ MAX_RIM_PITCHES = 10.0  # distances between neighbouring electrodes, by which a 
 MAX_PAD_BEYOND = 0.5  # share of a pad that may lie more than one such distance outside of all electrodes
 MAX_OVERLAP = 0.02  # of the smaller of two pads
 VOLTAGES = 1e-9, 100.0  # V: least and greatest largest reading that electronics can measure
+MIN_READING = 1e-5  # of the largest reading: less than half a step of a converter of 16 bits
+MAX_EMPTY = 0.25  # share of the readings that may be smaller
+EMPTY_REMEDY = "choose other rows for the protocol: drive and sense pairs that lie further apart and overlap"
 MAX_CURRENT = 0.1  # A: EIT drives some milliamperes
 PAD_POINTS = 32  # along each side of a pad's box, at which that share is counted
 
@@ -63,6 +66,13 @@ def voltage_findings(readings: np.ndarray) -> Iterator[Finding]:
             f"{'above 100 V' if largest > high else 'below 1 nV'}"
         )
         yield Finding(Severity.WARNING, "/device", what, remedy)
+    empty = int(np.sum(readings < MIN_READING * largest))
+    if empty > MAX_EMPTY * readings.size:
+        what = (
+            f"{empty} of {readings.size} readings of the untouched skin hold less than {100 * MIN_READING:g} % of the "
+            "voltage of the largest one: a converter reads them as zero"
+        )
+        yield Finding(Severity.WARNING, "/device", what, EMPTY_REMEDY)
 
 
 def _own_skin(session: Session, findings: list[Finding]) -> je.Skin | None:

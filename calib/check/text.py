@@ -149,9 +149,10 @@ def _channels(report: CheckReport, verbose: bool) -> Iterator[str]:
         f"median SNR {_number(_median(table.snr), '.1f')} dB, "
         f"{_reciprocity(table)}"
     )
+    empty = f"{table.empty.sum()} empty by the model, " if table.empty.any() else ""
     yield (
         f"         {table.dead.sum()} dead, {table.saturated.sum()} saturated, "
-        f"{table.noisy.sum()} noisy, {(table.missing > 0).sum()} with missing values"
+        f"{table.noisy.sum()} noisy, {empty}{(table.missing > 0).sum()} with missing values"
     )
     order = report.order
     if order is not None:
@@ -192,7 +193,7 @@ def _terminals(table: ChannelTable, i: int) -> tuple[str, str]:
 
 
 def _channel(table: ChannelTable, i: int) -> tuple[str, ...]:
-    names = ("dead", "saturated", "noisy")
+    names = ("dead", "saturated", "noisy", "empty")
     return (
         f"  {i}",
         *_terminals(table, i),
@@ -205,9 +206,9 @@ def _channel(table: ChannelTable, i: int) -> tuple[str, ...]:
 
 
 def worst(table: ChannelTable, count: int = MAX_LISTED) -> np.ndarray:
-    """Readings to look at first: flagged ones, then by missing samples and reciprocity error; dead ones last."""
+    """Readings to look at first: flagged, then by missing samples and reciprocity error; last dead and empty ones."""
     flagged = 2 * table.saturated + 1 * table.noisy
-    keys = (-np.nan_to_num(table.reciprocity), -table.missing.round(3), -flagged, table.dead)
+    keys = (-np.nan_to_num(table.reciprocity), -table.missing.round(3), -flagged, table.dead | table.empty)
     return np.lexsort(keys)[:count]
 
 

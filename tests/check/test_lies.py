@@ -214,8 +214,8 @@ def lost_electrode(noise, half=False):
     return tell
 
 
-def pair_exchanged(first, second):
-    """The wires of two electrodes are exchanged."""
+def pair_exchanged(first, second, half=False):
+    """The wires of two electrodes are exchanged, in the whole recording or in its second half."""
 
     def tell(r):
         number = np.arange(25)
@@ -223,7 +223,9 @@ def pair_exchanged(first, second):
         patterns = r.facts.pattern, number[r.facts.pattern]
         transfer = transfer_matrix(je.load_skin(r.facts.skin_name))
         own, wrong = (r.facts.current * predict_readings(transfer, pattern) for pattern in patterns)
-        return r.change("eit", r.values("eit") - own + wrong)
+        values = r.values("eit").copy()
+        values[len(values) // 2 if half else 0 :] += wrong - own
+        return r.change("eit", values)
 
     return tell
 
@@ -431,6 +433,11 @@ LIES = {
     "gain of EIT 1.1 from the middle on": Lie(
         in_half("eit", lambda v: 1.1 * v), WARNING, ("differ from 28.4 s", "1.1 times that of the other frames")
     ),
+    "EIT less a frame of the untouched skin": Lie(
+        lambda r: r.change("eit", r.values("eit") - r.values("eit")[:40].mean(0)),
+        WARNING,
+        ("/streams/eit", "a reference frame was subtracted", "record the voltages themselves"),
+    ),
     "offset of EIT": Lie(added("eit", 0.01), WARNING, ("/streams/eit", "+0.0101 V in addition", "offset")),
     "one reading reversed": Lie(channels("eit", [275], -1), WARNING, ("reading 275 has the opposite sign",)),
     "one reading twice as large": Lie(channels("eit", [100], 2), WARNING, ("reading 100 is 2 times",)),
@@ -454,6 +461,9 @@ LIES = {
     "readings in reversed order": Lie(readings(lambda n: np.arange(n)[::-1]), ERROR, ("reversed order",)),
     "readings rolled": Lie(readings(lambda n: np.roll(np.arange(n), -7)), ERROR, ("starts at reading 7 ",)),
     "electrode pair exchanged": Lie(pair_exchanged(3, 17), ERROR, ("electrodes 3 and 17 are exchanged",)),
+    "electrode pair exchanged from the middle on": Lie(
+        pair_exchanged(11, 12, half=True), ERROR, ("differ from 28.4 s", "electrodes 11 and 12 are exchanged")
+    ),
     "neighbouring electrodes exchanged": Lie(pair_exchanged(23, 24), ERROR, ("electrodes 23 and 24 are exchanged",)),
     "pressure columns exchanged": Lie(
         columns("pressure", [1, 0, 2, 3]), ERROR, ("column 1 responds over pad 'lower left'",)

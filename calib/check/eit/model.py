@@ -7,6 +7,8 @@ import numpy as np
 from ..report import ChannelTable
 from .reading_order import OrderCheck, check_order, predict_readings
 
+ROUNDING = 1e-6  # of the largest voltage: some roundings of single precision, in which the model is solved
+
 
 @dataclass(frozen=True, eq=False)
 class SkinModel:
@@ -24,6 +26,11 @@ class SkinModel:
     current: float
     positions: np.ndarray
     usual: np.ndarray
+
+    @property
+    def rounding(self) -> float:
+        """Voltage (V) below which a predicted reading, a difference of large ones, may be rounding alone."""
+        return ROUNDING * self.current * float(np.abs(self.transfer).max(initial=0.0))
 
     def predict(self, table: ChannelTable) -> np.ndarray:
         """Readings (readings,) of the uniform sheet, V."""

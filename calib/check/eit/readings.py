@@ -1,6 +1,7 @@
 """Check the EIT readings of a recording: dead, saturated, noisy or not reciprocal readings, and their order."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from ...session import Session, Status
 from ...session.units import SECOND
 from ..evidence import PressEvidence
 from ..report import ChannelTable, Finding, Severity, listed
+from ..skin import EMPTY_REMEDY, MAX_EMPTY
 from ..streams.statistics import StreamStatistics
 from .contradictions import check_reciprocity, lost_electrode_findings, offset_finding
 from .grouping import common_electrodes, readings_of_electrodes
@@ -23,11 +25,15 @@ from .rests import rest_change, rest_finding
 MIN_SNR = 40.0  # dB; healthy benches reach 50 to 60
 NOISE_RATIO = 5.0  # over the median noise of the readings
 SATURATED_FRACTION = 0.01  # of the samples at the converter's end
+UNIFORM_DEVIATION = 12**-0.5  # standard deviation of what a converter rounds off, over its step
 MIN_SHARED_EXTREMES = 3  # so many readings with one extreme value are at the converter's end; fewer may be chance
 MAX_EMPTY_FRACTION = 0.25  # of the readings without a value, up to which the others make an image
 MAX_SATURATED_FRACTION = 0.05  # of the readings: those beside the drive may clip without much harm to an image
 MIN_REST_FRAMES, MAX_REST_FRAMES = 8, 2000
 MIN_SOUND_READINGS = 10  # for a comparison with the model
+# Quantile of the changes of the frames, which is that of a touch; and the part of it, and of the model's voltage, below
+# which the frame at rest is none of voltages.
+TOUCHED, MAX_REST = 0.95, 0.3
 
 
 def check_eit(
@@ -47,11 +53,15 @@ def check_eit(
     if stats is None or pattern is None or stats.row.variable != "voltage":
         return None, None
     findings += _frame_rate_findings(session, stats, skin)
-    table = _channel_table(stats, session, presses)
-    findings += _channel_findings(stats, table)
     model = None
     if skin is not None and pattern.max() < len(skin.electrodes):
         model = _model(session, skin, transfer, findings)
+    table = _channel_table(stats, session, presses, model)
+    findings += _fault_findings(stats, table)
+    if model is not None and _is_difference(stats, table, model):
+        findings.append(_difference_finding(table, model))
+        return table, None
+    findings += _noise_findings(table)
     change = None if evidence is None else rest_change(evidence, stats)
     changed = None if change is None else rest_finding(change, int(stats.time[0]), table, model)
     if changed is not None:
@@ -84,6 +94,10 @@ def _sound(table: ChannelTable) -> np.ndarray:
 def _check_order(table: ChannelTable, good: np.ndarray, model: SkinModel, findings: list[Finding]) -> OrderCheck | None:
     """Compare the good readings (readings,) with a uniform sheet; None if there are too few."""
     if good.sum() < max(MIN_SOUND_READINGS, len(good) // 4):
+        if good.all():
+            what = f"a frame has only {len(good)} readings: too few to check their order and signs"
+            findings.append(Finding(Severity.OK, "/streams/eit", what, f"scan {MIN_SOUND_READINGS} readings or more"))
+            return None
         what = f"only {good.sum()} readings are sound: order and signs were not checked"
         findings.append(Finding(Severity.WARNING, "/streams/eit", what, "correct the readings above first"))
         return None
@@ -135,7 +149,9 @@ def _rest_frames(time: np.ndarray, presses: PressColumns | None) -> slice:
     return slice(start, start + min(int(sizes.max()), MAX_REST_FRAMES))
 
 
-def _channel_table(stats: StreamStatistics, session: Session, presses: PressColumns | None) -> ChannelTable:
+def _channel_table(
+    stats: StreamStatistics, session: Session, presses: PressColumns | None, model: SkinModel | None
+) -> ChannelTable:
     pattern, mixing = np.asarray(session.pattern), session.mixing
     rest = _rest_frames(stats.time, presses)
     values = stats.stream.read(rest.start, rest.stop)
@@ -147,8 +163,10 @@ def _channel_table(stats: StreamStatistics, session: Session, presses: PressColu
     partner = je.skin.reciprocal_rows(pattern) if mixing is None else np.full(len(mean), -1)
     # Readings of a symmetric skin share values where there is no noise, far from the converter's end.
     saturated = _saturated(stats, by_shared=not session.simulated and bool((noise > 0).any()))
+    step = _converter_step(values)
     typical = np.median(noise[np.isfinite(noise)]) if np.isfinite(noise).any() else np.inf
-    return ChannelTable(
+    typical = max(typical, step * UNIFORM_DEVIATION)
+    table = ChannelTable(
         frames=len(values),
         pattern=pattern,
         mean=mean,
@@ -161,7 +179,29 @@ def _channel_table(stats: StreamStatistics, session: Session, presses: PressColu
         saturated=saturated,
         mixing=mixing,
         noisy=(noise > NOISE_RATIO * typical) & (snr < MIN_SNR) & ~stats.dead,
+        empty=np.zeros(len(mean), bool),
     )
+    return table if model is None else _without_empty(table, stats, model, max(typical, step / 2))
+
+
+def _converter_step(values: np.ndarray) -> float:
+    """Least difference (V) of two successive frames in one reading: a step of the converter; 0 without any."""
+    steps = np.abs(np.diff(values, axis=0))
+    return float(np.min(steps, where=steps > 0, initial=np.inf)) if (steps > 0).any() else 0.0
+
+
+def _without_empty(table: ChannelTable, stats: StreamStatistics, model: SkinModel, floor: float) -> ChannelTable:
+    """The table with the readings marked that hold no voltage by the model; those of them that are zero are not dead.
+
+    Args:
+        floor: voltage (V) that noise or a step of the converter hides.
+    """
+    if table.dead.all() or not np.isfinite(floor):
+        return table
+    floor = max(floor, model.rounding)
+    empty = (np.abs(model.predict(table)) < floor) & ~(np.abs(table.mean) > NOISE_RATIO * floor)
+    zero = np.fmax(np.abs(stats.low), np.abs(stats.high)) <= floor
+    return replace(table, empty=empty, dead=table.dead & ~(empty & zero))
 
 
 def _reciprocity(mean: np.ndarray, partner: np.ndarray) -> np.ndarray:
@@ -187,8 +227,30 @@ def _saturated(stats: StreamStatistics, by_shared: bool) -> np.ndarray:
     return out
 
 
-def _channel_findings(stats: StreamStatistics, table: ChannelTable) -> Iterator[Finding]:
-    where = "/streams/eit"
+def _is_difference(stats: StreamStatistics, table: ChannelTable, model: SkinModel) -> bool:
+    """Whether a frame of the untouched skin was subtracted: frames at rest are small beside those under load."""
+    good = _sound(table)
+    if not good.any():
+        return False
+    rest, noise, expected = (
+        float(np.sqrt(np.mean(part[good] ** 2))) for part in (table.mean, table.noise, model.predict(table))
+    )
+    touched = float(np.quantile(stats.activity, TOUCHED))
+    return touched > NOISE_RATIO * noise and rest < min(MAX_REST * touched, MAX_REST * expected)
+
+
+def _difference_finding(table: ChannelTable, model: SkinModel) -> Finding:
+    rest, expected = (1e3 * float(np.nanmedian(np.abs(part))) for part in (table.mean, model.predict(table)))
+    what = (
+        f"the readings of the untouched skin are about zero ({rest:.2g} mV, median) and those of a press are not: a "
+        f"reference frame was subtracted, or frames were divided by it; the model expects {expected:.2g} mV. Order and "
+        "signs were not checked"
+    )
+    return Finding(Severity.WARNING, "/streams/eit", what, "record the voltages themselves, or add the reference again")
+
+
+def _fault_findings(stats: StreamStatistics, table: ChannelTable) -> Iterator[Finding]:
+    """Readings that are dead or saturated."""
     remedy = "check the wires and terminals of these electrodes"
     empty = stats.finite == 0
     # A calibration leaves out readings without a value, and so loses little if they are few.
@@ -200,9 +262,17 @@ def _channel_findings(stats: StreamStatistics, table: ChannelTable) -> Iterator[
     gain = "lower the gain or the drive current"
     severity = Severity.WARNING if table.saturated.mean() < MAX_SATURATED_FRACTION else Severity.ERROR
     yield from _channel_list_finding(table.saturated, table, severity, what, gain)
+
+
+def _noise_findings(table: ChannelTable) -> Iterator[Finding]:
+    """Readings that are noisy, empty by the model, or low as a whole."""
+    where, remedy = "/streams/eit", "check the wires and terminals of these electrodes"
     what = f"are more than {NOISE_RATIO:g} times noisier than most and below {MIN_SNR:g} dB"
     yield from _channel_list_finding(table.noisy, table, Severity.WARNING, what, remedy)
-    snr = table.snr[~table.bad & ~np.isnan(table.snr)]
+    if table.empty.mean() > MAX_EMPTY:
+        what = f"{table.empty.sum()} of {len(table)} readings hold no voltage above the noise, as the model expects"
+        yield Finding(Severity.OK, where, f"{what}: {listed(np.flatnonzero(table.empty))}", EMPTY_REMEDY)
+    snr = table.snr[~table.bad & ~table.empty & ~np.isnan(table.snr)]
     if len(snr) and np.median(snr) < MIN_SNR:
         what = f"low signal: the median SNR of a reading is {np.median(snr):.1f} dB, below {MIN_SNR:g} dB"
         remedy = "raise the current or the averaging, improve the contacts, shield against mains hum"
@@ -222,7 +292,7 @@ def _channel_list_finding(
     if not len(rows):
         return
     text = f"{len(rows)} of {len(table)} readings {what}: {listed(rows)}"
-    common = common_electrodes(flag, readings_of_electrodes(table))
+    common = common_electrodes(flag, readings_of_electrodes(table), ~table.empty | flag)
     if common:
         text += f"; all of them use electrode {' or '.join(map(str, common))}"
         remedy = f"check electrode {' and '.join(map(str, common))}: its terminal, wire and switch"

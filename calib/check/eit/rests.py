@@ -160,11 +160,13 @@ def _explanation(
     if ((a >= 0).all() or (a <= 0).all()) and np.corrcoef(*sizes)[0, 1] > ALIKE:
         return "magnitudes without sign", "record the signed (in-phase) voltage, not its amplitude", Severity.ERROR
     local = _local_explanation(wrong, right, known, table)
-    if local is not None:
+    if local is not None and local[2] is Severity.ERROR:
         return local
     order = None if model is None else model.check(wrong, known & ~table.dead, table)
     if order is not None and order.claimed:
         return order.what, f"{order.remedy}, or use the other part only", Severity.ERROR
+    if local is not None:
+        return local
     if alike > MAX_UNNAMED:
         return None
     what = f"they correlate by {alike:.2f} with the other frames"
