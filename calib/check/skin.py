@@ -16,12 +16,14 @@ RIM_POINTS = 256  # along the rim of the sheet, whose distances to the electrode
 MAX_RIM_PITCHES = 10.0  # distances between neighbouring electrodes, by which a sheet may reach beyond them
 MAX_PAD_BEYOND = 0.5  # share of a pad that may lie more than one such distance outside of all electrodes
 MAX_OVERLAP = 0.02  # of the smaller of two pads
+MAX_PAD_OUTSIDE = 0.2  # share of a pad that may lie beyond the sheet
+MIN_COVER = 0.5  # share of the sheet that pads usually cover
 VOLTAGES = 1e-9, 100.0  # V: least and greatest largest reading that electronics can measure
 MIN_READING = 1e-5  # of the largest reading: less than half a step of a converter of 16 bits
 MAX_EMPTY = 0.25  # share of the readings that may be smaller
 EMPTY_REMEDY = "choose other rows for the protocol: drive and sense pairs that lie further apart and overlap"
 MAX_CURRENT = 0.1  # A: EIT drives some milliamperes
-PAD_POINTS = 32  # along each side of a pad's box, at which that share is counted
+PAD_POINTS = 32  # along each side of the box around a shape, at which shares are counted
 
 
 def check_skin(session: Session, given: je.Skin | None, findings: list[Finding]) -> je.Skin | None:
@@ -42,6 +44,7 @@ def skin_findings(skin: je.Skin) -> Iterator[Finding]:
     """What a skin describes that can hardly be: sizes, currents, pads over one another, readings taken twice."""
     yield from _size_findings(skin)
     yield from _overlap_findings(skin)
+    yield from _cover_findings(skin)
     if skin.protocol.current > MAX_CURRENT:
         what = f"the drive current is {skin.protocol.current:g} A; scans of skins drive some milliamperes"
         yield Finding(Severity.WARNING, "/device", what, "give the current of the protocol in A, such as 1e-3")
@@ -147,15 +150,34 @@ def _overlap_findings(skin: je.Skin) -> Iterator[Finding]:
             yield Finding(Severity.WARNING, "/device", what, todo)
 
 
+def _cover_findings(skin: je.Skin) -> Iterator[Finding]:
+    """Pads beyond the sheet, and a sheet without pads under it."""
+    for pad in skin.pads:
+        outside = 1 - float(np.mean(skin.domain.contains(_points_in(je.geometry.Polygon(pad.outline)))))
+        if outside > MAX_PAD_OUTSIDE:
+            what = f"{100 * outside:.0f} % of pad {pad.name!r} lies beyond the sheet"
+            yield Finding(Severity.WARNING, "/device", what, "correct the corners of the pad, or the size of the sheet")
+    points = _points_in(skin.domain)
+    on_pads = np.any([je.geometry.Polygon(pad.outline).contains(points) for pad in skin.pads], 0)
+    if (cover := float(np.mean(on_pads))) < MIN_COVER:
+        what = f"pads lie under {100 * cover:.0f} % of the sheet; no pad tells the forces of contacts elsewhere"
+        yield Finding(Severity.OK, "/device", what, "press on pads to calibrate: presses beside them are left out")
+
+
 def _share_beyond(pad: je.Pad, hull: np.ndarray, pitch: float) -> float:
     """Share of a pad that lies more than a pitch outside of a hull, given by `ConvexHull.equations`."""
-    low, high = pad.outline.min(0), pad.outline.max(0)
+    points = _points_in(je.geometry.Polygon(pad.outline))
+    return float(np.mean((points @ hull[:, :2].T + hull[:, 2]).max(1) > pitch))
+
+
+def _points_in(shape: je.geometry.Domain) -> np.ndarray:
+    """Points of a grid over a shape, (n, 2) m; its corners where it is too narrow for the grid."""
+    corners = shape.boundary_point(np.linspace(0, shape.perimeter, RIM_POINTS, endpoint=False))
+    low, high = corners.min(0), corners.max(0)
     at = (np.arange(PAD_POINTS) + 0.5) / PAD_POINTS
     box = low + np.stack(np.meshgrid(at, at), -1).reshape(-1, 2) * (high - low)
-    points = box[je.geometry.Polygon(pad.outline).contains(box)]
-    if not len(points):
-        return 0.0
-    return float(np.mean((points @ hull[:, :2].T + hull[:, 2]).max(1) > pitch))
+    points = box[shape.contains(box)]
+    return points if len(points) else corners
 
 
 def _protocol_findings(session: Session, skin: je.Skin) -> Iterator[Finding]:

@@ -23,6 +23,7 @@ from .corrections import (
 from .detection import find_presses
 from .means import PressMeans, hold_positions, press_means
 from .samples import PressSamples, press_samples
+from .skins import rests_on_pads
 from .streams import finite_mean, index_ranges, recording_end
 from .times import reject
 from .windows import PressWindows, WindowLengths, press_windows, reject_without_samples
@@ -140,7 +141,7 @@ def measure(
     channels, lost = _finite_channels(means["eit"], presses.accepted)
     _require_pads(session, skin, means["pressure"][presses.accepted])
     force = means["force"][:, 0]
-    presses = _with_force(session, presses, force, means["pressure"])
+    presses = _with_force(session, _on_pads(presses, skin), force, means["pressure"])
     kept = presses.accepted
     return PressMeasurements(
         session=session,
@@ -249,6 +250,12 @@ def _held(streams: dict[str, Stream], windows: PressWindows, processing: Process
         name: press_means(stream, windows, baseline=processing.baseline, corrections=processing.of(stream))
         for name, stream in streams.items()
     }
+
+
+def _on_pads(presses: PressTable, skin: je.Skin) -> PressTable:
+    """The presses, without those beside all pads, whose force no pad tells."""
+    on_pads = rests_on_pads(skin, np.stack([presses.x, presses.y], 1), presses.tip_diameter)
+    return reject(presses, ["" if on else "it rests on no pad" for on in on_pads])
 
 
 def _with_force(session: Session, presses: PressTable, force: np.ndarray, pressure: np.ndarray) -> PressTable:

@@ -457,6 +457,23 @@ def test_presses_are_missed(parts, look):
 # --- skin and protocol ---------------------------------------------------------------------------
 
 
+def test_a_pad_that_lies_beyond_the_sheet_is_named(parts, look):
+    parts.toml = parts.toml.replace("rectangle = [0.1, 0.1, 0.2, 0.2]", "rectangle = [0.1, 0.1, 0.3, 0.2]")
+    has(look(parts), Severity.WARNING, "50 % of pad 'upper right' lies beyond the sheet")
+
+
+def test_presses_beside_all_pads_are_told_by_their_places(parts, look):
+    for corner, small in (
+        ("0.0, 0.0, 0.1, 0.1", "0.0, 0.0, 0.03, 0.03"),
+        ("0.1, 0.1, 0.2, 0.2", "0.17, 0.17, 0.2, 0.2"),
+    ):
+        parts.toml = parts.toml.replace(f"rectangle = [{corner}]", f"rectangle = [{small}]")
+    parts.change("pressure", 0 * parts.values("pressure"))
+    found = look(parts)
+    has(found, Severity.WARNING, "presses rest on no pad")
+    assert not any("no pad feels" in one.what and "tubes" in one.remedy for one in found.findings)
+
+
 @pytest.mark.parametrize("size", ["[0.2, 2.0]", "[20.0, 0.2]"])
 def test_a_sheet_that_reaches_far_beyond_its_electrodes_is_named(size, parts, look):
     """The readings alone follow such a sheet nearly as well."""

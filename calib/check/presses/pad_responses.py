@@ -6,6 +6,7 @@ import numpy as np
 
 import jaxeit as je
 
+from ...presses.skins import rests_on_pads
 from ..evidence import PressEvidence
 from ..parts import flagged_part
 from ..report import Finding, Severity, counted, listed
@@ -48,8 +49,10 @@ def pad_response_findings(evidence: PressEvidence, skin: je.Skin, start: int) ->
         for pad, factor in scaled.items():
             yield _scale_finding(skin, pad, factor)
         known, response = np.isin(alone, [*scaled]), size / force[:, None]
+        beside = ~_on_pads(evidence, skin)
+        yield from _beside_findings(evidence, beside)
         unfelt = response.sum(1) < MIN_PAD_RESPONSE * np.median(response.sum(1))
-        yield from _unfelt_findings(evidence, unfelt & ~known)
+        yield from _unfelt_findings(evidence, unfelt & ~known & ~beside)
         yield from _silent_findings(evidence, skin, response, np.where(known, -1, alone), unfelt)
     falling = [*_falling_findings(evidence, skin, strongest, largest, start)]
     yield from falling
@@ -118,6 +121,21 @@ def _scale_finding(skin: je.Skin, pad: int, factor: float) -> Finding:
     what = f"column {pad}, pad {skin.pads[pad].name!r}, reads {factor:.2g} {of_others}"
     remedy = "check its unit (Pa, kPa, mbar) at import, its gain and its tube"
     return Finding(Severity.WARNING, PRESSURE, what, remedy)
+
+
+def _on_pads(evidence: PressEvidence, skin: je.Skin) -> np.ndarray:
+    """Which presses rest on pads, flags (presses,); all of unknown places."""
+    if evidence.site is None:
+        return np.ones(len(evidence.number), bool)
+    tip = np.asarray(getattr(evidence.presses, "tip_diameter", np.zeros(len(evidence.presses.t_press))), float)
+    return rests_on_pads(skin, evidence.site, tip[evidence.number])
+
+
+def _beside_findings(evidence: PressEvidence, beside: np.ndarray) -> Iterator[Finding]:
+    """Presses whose place lies beside all pads, flags (presses,)."""
+    if beside.any():
+        what = f"{beside.sum()} of {len(beside)} presses rest on no pad: {listed(evidence.number[beside])}"
+        yield Finding(Severity.WARNING, "/presses", what, "they are left out: no pad tells their force; press on pads")
 
 
 def _unfelt_findings(evidence: PressEvidence, unfelt: np.ndarray) -> Iterator[Finding]:

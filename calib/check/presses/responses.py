@@ -16,7 +16,7 @@ def reading_response_findings(evidence: PressEvidence, table: ChannelTable) -> I
     """Presses in which no reading changes."""
     if evidence.eit is None or not len(evidence.seen):
         return
-    good = ~table.dead & np.isfinite(evidence.eit.mean).all(0)
+    good = ~(table.dead | table.empty) & np.isfinite(evidence.eit.mean).all(0)
     changed = np.array([_changes(*row) for row in zip(*_of_readings(evidence, good), strict=True)])
     if changed.all():
         return
