@@ -10,13 +10,14 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from .._compile import require_known, verb
-from ..imaging.noise import InverseError, Whitening, require_real, whitened_readings
+from ..imaging.noise import InverseError, Whitening, require_real
 from ..least_squares import ImplicitStep
 from ..least_squares.searches import normal_inverse
 from ..model.discretisation import Model
 from ..model.forward_model import conductivity, forward
 from .bump_responses import mean_conductivity, points_of
 from .fit import MAX_STEPS, SOLVER, bounds_of
+from .preparation import sheet_and_readings
 from .result import ContactResult, Contacts
 
 
@@ -27,6 +28,7 @@ def refine_contacts(
     *,
     noise: Float[ArrayLike, "..."],
     widths: tuple[float, float] = (0.003, 0.05),
+    untouched: Float[ArrayLike, " readings"] | None = None,
     sigma: Float[Array, " elements"] | None = None,
     channels: Bool[ArrayLike, " readings"] | None = None,
 ) -> Contacts:
@@ -37,15 +39,15 @@ def refine_contacts(
     Args:
         dv: difference of frames, (readings,) V.
         contacts: from a `ContactFinder`, of one frame; which are present is not looked at again.
-        noise, sigma, channels: as for `prepare_contacts`.
+        noise, untouched, sigma, channels: as for `prepare_contacts`.
         widths: bounds, m.
 
     Raises:
-        InverseError: if shapes do not fit, or a reading that is used is not finite.
+        InverseError: as for `prepare_contacts`, or if shapes do not fit, or a reading that is used is not finite.
     """
-    require_known("refine_contacts", InverseError, model, dv, contacts, noise, sigma, channels)
+    require_known("refine_contacts", InverseError, dv, contacts)
     require_real(dv=dv)
-    found = whitened_readings(model, noise, channels)
+    sigma, found = sheet_and_readings("refine_contacts", model, noise, untouched, sigma, channels)
     readings, dv, used = model.readings, np.asarray(dv, float), np.asarray(found.whitening.channels)
     if dv.shape != (readings,) or contacts.present.ndim != 1:
         raise InverseError(f"dv has shape {dv.shape}; refine one frame of {readings} readings at a time")

@@ -248,6 +248,21 @@ def test_refined_through_the_forward_map(finder, model):
     assert found.result[0] == ContactResult.CONVERGED
 
 
+@pytest.mark.slow
+def test_an_untouched_frame_refines_as_the_sheet_that_is_fitted_to_it(finder, model):
+    coat = model.background * (1 + 0.3 * _means(model, np.array([0.1, 0.1]), 0.05))
+    untouched = je.forward(model, coat)
+    dv = np.asarray(je.forward(model, coat * (1 + 0.5 * _means(model, np.array([0.064, 0.131]), 0.012))) - untouched)
+    (quick,) = _find(finder, dv)
+    noise = np.full(550, STD)
+    by_frame = refine_contacts(model, dv, quick, noise=noise, untouched=untouched)
+    by_sheet = refine_contacts(model, dv, quick, noise=noise, sigma=je.fit_background(model, untouched))
+    np.testing.assert_allclose(by_frame.position, by_sheet.position, atol=1e-9)
+    even = refine_contacts(model, dv, quick, noise=noise)
+    away = [np.linalg.norm(np.asarray(found.position[0]) - [0.064, 0.131]) for found in (by_frame, even)]
+    assert away[0] < 0.5 * away[1]
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
