@@ -8,7 +8,7 @@ import textwrap
 
 import pytest
 
-from ..hard_cases import INTRODUCTION, Row, merge, table, worst
+from ..hard_cases import INTRODUCTION, Row, cells_of, document, merge, table, worst
 
 SUITE = """
     import pytest
@@ -104,3 +104,8 @@ def test_a_file_of_tests_is_not_written_over(run, tmp_path):
     said, _ = run("--hard-cases", "test_suite.py")
     assert "--hard-cases test_suite.py: not written over" in said
     assert (tmp_path / "test_suite.py").read_text() == textwrap.dedent(SUITE)
+
+
+def test_the_page_says_what_is_written_around_its_tables(root):
+    page = (root / "docs" / "hard-cases.md").read_text(encoding="utf-8")
+    assert page == document(cells_of(page))
