@@ -91,8 +91,12 @@ class Stream:
         bad = times[start + 1 : stop] <= times[start : stop - 1]
         if bad.any():
             row = start + int(np.argmax(bad)) + 1
-            what = f"does not increase at row {row} ({times[row - 1]} then {times[row]})"
-            raise self._time.node.error(what, "sort the rows and drop equal times")
+            back = (int(times[row - 1]) - int(times[row])) / 1e9
+            how, remedy = "it repeats the time of the row before", "drop rows of equal times"
+            if back:
+                how = f"it jumps back by {back:.4g} s"
+                remedy = "sort the rows if they are out of order; if a clock was set back, keep one part"
+            raise self._time.node.error(f"does not increase at row {row} ({how})", remedy)
 
     def read(self, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Samples ``start:stop`` as float64 (n, channels) in SI; missing values, and those above 1e18, are NaN."""
