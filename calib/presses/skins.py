@@ -32,7 +32,7 @@ def rests_on_pads(
 ) -> Bool[np.ndarray, " presses"]:
     """Whether the middle of a tip or a third of what it presses lies on pads, which then tell its force.
 
-    Presses of unknown place count as such.
+    Presses of unknown place, and beyond the sheet, count as such: the check of places names what is wrong with them.
     """
     radius = np.maximum(0.5 * tip_diameter, USUAL_RADIUS)[:, None, None]
     number = np.arange(AREA_POINTS)  # 0 is the middle; the others follow Vogel's spiral
@@ -43,4 +43,4 @@ def rests_on_pads(
     on_pads = np.any([Polygon(pad.outline).contains(flat) for pad in skin.pads], 0).reshape(points.shape[:2])
     on_sheet = skin.domain.contains(flat).reshape(points.shape[:2])
     part = (on_pads & on_sheet).sum(1) >= MIN_PART * on_sheet.sum(1)
-    return np.asarray(on_pads[:, 0] | (part & on_sheet.any(1)) | ~np.isfinite(position).all(1))
+    return np.asarray(on_pads[:, 0] | part | ~on_sheet[:, 0] | ~np.isfinite(position).all(1))

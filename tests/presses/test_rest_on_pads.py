@@ -20,9 +20,11 @@ def one_pad(skin):
 
 
 def test_a_press_rests_on_a_pad_by_its_middle_or_by_a_third_of_its_area(one_pad):
-    places = np.array([[0.13, 0.12], [0.1501, 0.125], [0.154, 0.125], [0.17, 0.125], [0.03, 0.03], [np.nan, 0.0]])
-    found = rests_on_pads(one_pad, places, np.zeros(6))
-    assert found.tolist() == [True, True, False, False, False, True]
+    places = np.array(
+        [[0.13, 0.12], [0.1501, 0.125], [0.154, 0.125], [0.17, 0.125], [0.03, 0.03], [np.nan, 0.0], [0.3, 0.1]]
+    )
+    found = rests_on_pads(one_pad, places, np.zeros(7))
+    assert found.tolist() == [True, True, False, False, False, True, True]
     assert rests_on_pads(one_pad, places[2:3], np.array([0.06])).tolist() == [False]
 
 
