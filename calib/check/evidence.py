@@ -46,6 +46,12 @@ class PressEvidence:
         """Times at which the presses of the rows begin, (rows,) ns."""
         return np.asarray(np.asarray(self.presses.t_press)[self.number])
 
+    @property
+    def tip_diameter(self) -> np.ndarray:
+        """Diameter of the tip in each row, (rows,) m; 0 where the recording has no table of presses."""
+        known = getattr(self.presses, "tip_diameter", np.zeros(len(self.presses.t_press)))
+        return np.asarray(np.asarray(known, float)[self.number])
+
     def compared(self) -> tuple[PressColumns, PressWindows]:
         """The presses whose frames were read, and their windows."""
         return _chosen(self.presses, self.windows, self.number[self.seen])

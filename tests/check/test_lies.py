@@ -654,6 +654,7 @@ def found_by_pads(skin, site, pressure):
         "site": site,
         "force": np.full(24, 10.0),
         "pressure": pressure,
+        "tip_diameter": np.zeros(24),
         "times": numbers * SECOND,
     }
     return [*pad_response_findings(stand_in(PressEvidence, **held), skin, 0)]

@@ -127,8 +127,7 @@ def _on_pads(evidence: PressEvidence, skin: je.Skin) -> np.ndarray:
     """Which presses rest on pads, flags (presses,); all of unknown places."""
     if evidence.site is None:
         return np.ones(len(evidence.number), bool)
-    tip = np.asarray(getattr(evidence.presses, "tip_diameter", np.zeros(len(evidence.presses.t_press))), float)
-    return rests_on_pads(skin, evidence.site, tip[evidence.number])
+    return rests_on_pads(skin, evidence.site, evidence.tip_diameter)
 
 
 def _beside_findings(evidence: PressEvidence, beside: np.ndarray) -> Iterator[Finding]:
