@@ -89,10 +89,9 @@ def contact_figure(bench: Bench, forces: dict[str, np.ndarray]) -> tuple[Figure,
     """Figure 8: the first press with both tips on one pad, and the first with a tip on each of two; and the errors of
     the contacts' forces, N."""
     tips = planned_motion(bench).places[: len(bench.sites)]  # (presses, 2, 2)
-    outlines = [je.Polygon(pad.outline) for pad in bench.scene.skin.pads]
-    pairs = tips.reshape(-1, 2)
-    inside = np.reshape([outline.contains(pairs) for outline in outlines], (-1, len(tips), 2))
-    away = np.reshape([outline.boundary_distance(pairs) for outline in outlines], (-1, len(tips), 2))
+    skin, pairs = bench.scene.skin, tips.reshape(-1, 2)
+    inside = skin.pads_at(pairs).reshape(-1, len(tips), 2)
+    away = np.reshape([pad.polygon.boundary_distance(pairs) for pad in skin.pads], (-1, len(tips), 2))
     under = inside.argmax(0)  # (presses, 2)
     within = (away.min(0) > 1e-6).all(1)  # else a tip rests on pads beside the one that its centre is on
     same = under[:, 0] == under[:, 1]

@@ -280,9 +280,8 @@ def _truth(motion: Motion) -> dict[str, tuple[np.ndarray, str]]:
 
 
 def _pad_under(bench: Bench) -> np.ndarray:
-    pads = [je.Polygon(pad.outline).contains(bench.sites) for pad in bench.scene.skin.pads]
-    inside = np.array(pads).reshape(len(pads), len(bench.sites))
-    return np.where(inside.any(0), inside.argmax(0), -1) if len(pads) else np.full(len(inside), -1)
+    inside = bench.scene.skin.pads_at(bench.sites)
+    return np.where(inside.any(0), inside.argmax(0), -1) if len(inside) else np.full(len(bench.sites), -1)
 
 
 def _nanoseconds(seconds: np.ndarray) -> np.ndarray:

@@ -114,7 +114,7 @@ def _flat(value: object, key: str = "") -> dict[str, object]:
 def _size_findings(skin: je.Skin) -> Iterator[Finding]:
     """A sheet or a pad that reaches far beyond the electrodes: their positions have a typo, or another unit."""
     electrodes = np.asarray(skin.electrode_positions)[:, :2]
-    rim = skin.domain.boundary_point(np.linspace(0, skin.domain.perimeter, RIM_POINTS, endpoint=False))
+    rim = _rim_points(skin.domain)
     between = np.linalg.norm(electrodes[:, None] - electrodes, axis=-1)
     np.fill_diagonal(between, np.inf)
     pitch = float(np.median(between.min(1)))
@@ -153,31 +153,34 @@ def _overlap_findings(skin: je.Skin) -> Iterator[Finding]:
 def _cover_findings(skin: je.Skin) -> Iterator[Finding]:
     """Pads beyond the sheet, and a sheet without pads under it."""
     for pad in skin.pads:
-        outside = 1 - float(np.mean(skin.domain.contains(_points_in(je.geometry.Polygon(pad.outline)))))
+        outside = 1 - float(np.mean(skin.domain.contains(_points_in(pad.polygon))))
         if outside > MAX_PAD_OUTSIDE:
             what = f"{100 * outside:.0f} % of pad {pad.name!r} lies beyond the sheet"
             yield Finding(Severity.WARNING, "/device", what, "correct the corners of the pad, or the size of the sheet")
-    points = _points_in(skin.domain)
-    on_pads = np.any([je.geometry.Polygon(pad.outline).contains(points) for pad in skin.pads], 0)
-    if (cover := float(np.mean(on_pads))) < MIN_COVER:
+    cover = float(np.mean(skin.pads_at(_points_in(skin.domain)).any(0)))
+    if cover < MIN_COVER:
         what = f"pads lie under {100 * cover:.0f} % of the sheet; no pad tells the forces of contacts elsewhere"
         yield Finding(Severity.OK, "/device", what, "press on pads to calibrate: presses beside them are left out")
 
 
 def _share_beyond(pad: je.Pad, hull: np.ndarray, pitch: float) -> float:
     """Share of a pad that lies more than a pitch outside of a hull, given by `ConvexHull.equations`."""
-    points = _points_in(je.geometry.Polygon(pad.outline))
+    points = _points_in(pad.polygon)
     return float(np.mean((points @ hull[:, :2].T + hull[:, 2]).max(1) > pitch))
 
 
 def _points_in(shape: je.geometry.Domain) -> np.ndarray:
-    """Points of a grid over a shape, (n, 2) m; its corners where it is too narrow for the grid."""
-    corners = shape.boundary_point(np.linspace(0, shape.perimeter, RIM_POINTS, endpoint=False))
-    low, high = corners.min(0), corners.max(0)
+    """Points of a grid over a shape, (n, 2) m; of its rim where it is too narrow for the grid."""
+    low, high = map(np.array, shape.bounds)
     at = (np.arange(PAD_POINTS) + 0.5) / PAD_POINTS
     box = low + np.stack(np.meshgrid(at, at), -1).reshape(-1, 2) * (high - low)
     points = box[shape.contains(box)]
-    return points if len(points) else corners
+    return points if len(points) else _rim_points(shape)
+
+
+def _rim_points(shape: je.geometry.Domain) -> np.ndarray:
+    """Points along the rim of a shape, (`RIM_POINTS`, 2) m."""
+    return shape.boundary_point(np.linspace(0, shape.perimeter, RIM_POINTS, endpoint=False))
 
 
 def _protocol_findings(session: Session, skin: je.Skin) -> Iterator[Finding]:

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxeit as je
-from jaxeit.geometry.shapes import Polygon
 from jaxeit.linalg.lapack import solve
 
 from .streams import robust_deviation
@@ -99,7 +98,7 @@ def fit_crosstalk(
 
 def _distance(pad: je.Pad, position: np.ndarray) -> np.ndarray:
     """Distance of positions to a pad, (n,) m; 0 on the pad."""
-    outline = Polygon(pad.outline)
+    outline = pad.polygon
     return np.where(outline.contains(position), 0.0, outline.boundary_distance(position))
 
 

@@ -4,7 +4,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import jaxeit as je
-from jaxeit.geometry import Polygon
 
 from ..session import Session
 
@@ -40,7 +39,7 @@ def rests_on_pads(
     area = np.sqrt(number / AREA_POINTS)[:, None] * np.stack([np.cos(turn), np.sin(turn)], 1)
     points = np.nan_to_num(position)[:, None] + radius * area
     flat = points.reshape(-1, 2)
-    on_pads = np.any([Polygon(pad.outline).contains(flat) for pad in skin.pads], 0).reshape(points.shape[:2])
+    on_pads = skin.pads_at(flat).any(0).reshape(points.shape[:2])
     on_sheet = skin.domain.contains(flat).reshape(points.shape[:2])
     part = (on_pads & on_sheet).sum(1) >= MIN_PART * on_sheet.sum(1)
     return np.asarray(on_pads[:, 0] | part | ~on_sheet[:, 0] | ~np.isfinite(position).all(1))

@@ -5,7 +5,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..effects import AbstractPadEffect, fold
-from ..geometry.shapes import Polygon
 from ..skin.description import Skin
 from .discretisation import Model
 
@@ -24,7 +23,7 @@ def pad_response(skin: Skin, model: Model) -> Float[Array, "pads elements"]:
     radii = np.linalg.norm(corners - centres[:, None], axis=-1).max(1)
     coverage, distance = [], []
     for pad in skin.pads:
-        outline = Polygon(pad.outline)
+        outline = pad.polygon
         distance.append(outline.boundary_distance(centres))
         covered = outline.contains(centres).astype(float)
         cut = np.flatnonzero(distance[-1] <= radii + outline.tolerance)  # others lie on one side of the outline

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._compile import require_known
 from ..fusion import pad_masks
-from ..geometry.shapes import Domain, Polygon
+from ..geometry.shapes import Domain
 from ..imaging.priors import Noser
 from ..model.bases import AbstractBasis, BasisMap, Pixels
 from ..model.discretisation import Model
@@ -204,7 +204,7 @@ def prepare_event_scan(
         by_pad=chosen(pad_masks(skin, image).weights, settings.local),
         by_place=chosen(places, settings.local),
         centres=jnp.asarray(centres, model.dtype),
-        pad_of=jnp.asarray(np.stack([Polygon(pad.outline).contains(centres) for pad in skin.pads], 1)),
+        pad_of=jnp.asarray(skin.pads_at(centres).T),
         onset=jnp.asarray(begins, model.dtype),
         release=jnp.asarray(ends, model.dtype),
         every=jnp.asarray(settings.every),

@@ -10,6 +10,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from ..budget import require
 from ..geometry.shapes import Disc, Domain, Polygon, Rectangle
@@ -40,7 +41,7 @@ class Pad:
 
     def __post_init__(self) -> None:
         try:
-            Polygon(self.outline)
+            self.polygon  # noqa: B018 - which refuses what is no outline
         except TypeError:
             raise SkinError(f"pad {self.name!r}: {stated(self.outline)} is not an outline; give {_CORNERS}") from None
         except ValueError as error:
@@ -48,9 +49,14 @@ class Pad:
         object.__setattr__(self, "outline", np.asarray(self.outline, float))
 
     @property
+    def polygon(self) -> Polygon:
+        """The outline as a shape."""
+        return Polygon(self.outline)
+
+    @property
     def area(self) -> float:
         """Area in m^2."""
-        return Polygon(self.outline).area
+        return self.polygon.area
 
 
 _CORNERS = "its corners [[x, y], ...] in m; those of a Rectangle or Polygon are its corner_points"
@@ -80,7 +86,7 @@ def pad_overlap(first: Pad, second: Pad) -> float:
     if (high <= low).any():
         return 0.0
     points = _points_in_box(low, high)
-    shapes = Polygon(first.outline), Polygon(second.outline)
+    shapes = first.polygon, second.polygon
     common = shapes[0].contains(points) & shapes[1].contains(points)
     return float(common.mean() * np.prod(high - low) / min(shape.area for shape in shapes))
 
@@ -143,6 +149,11 @@ class Skin:
         _require_apart(self.pads)
         if self.surface is not None:
             self.surface(_rim(self.domain))  # which refuses a sheet that it cannot carry
+
+    def pads_at(self, points: Float[np.ndarray, "points 2"]) -> Bool[np.ndarray, "pads points"]:
+        """Whether points of the sheet, m, lie on each pad."""
+        inside = [pad.polygon.contains(points) for pad in self.pads]
+        return np.reshape(inside, (len(self.pads), len(points))).astype(bool)
 
     @property
     def electrode_positions(self) -> np.ndarray:
@@ -341,7 +352,7 @@ def _misfit(pad: Pad, domain: Domain) -> str:
 def _meets(pad: Pad, domain: Domain) -> bool:
     """Whether a part of the pad lies on the sheet, by points on a grid over its box."""
     points = _points_in_box(pad.outline.min(0), pad.outline.max(0))
-    return bool((Polygon(pad.outline).contains(points) & domain.contains(points)).any())
+    return bool((pad.polygon.contains(points) & domain.contains(points)).any())
 
 
 def _sensor(table: TomlTable) -> PressureSensor:

@@ -78,8 +78,7 @@ def _stage_findings(presses: PressTable, evidence: PressEvidence, stage: Stream)
 
 
 def pads_under(skin: je.Skin, site: np.ndarray | None) -> np.ndarray:
-    """Whether a place lies on a pad, (pads, places)."""
+    """Whether a place lies on a pad, (pads, places); no columns for places that are not known."""
     if site is None:
         return np.zeros((len(skin.pads), 0), bool)
-    outlines = (je.Polygon(tuple((float(x), float(y)) for x, y in pad.outline)) for pad in skin.pads)
-    return np.array([outline.contains(site) for outline in outlines]).reshape(len(skin.pads), len(site))
+    return skin.pads_at(site)
