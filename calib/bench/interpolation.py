@@ -270,18 +270,18 @@ def _newton_basis(x: Float[np.ndarray, "*n"], count: int) -> Float[np.ndarray, "
 
 
 def frame_solver(model: je.Model, diameter: float) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
-    """Create a function that solves frames (points, readings).
+    """Create a function that solves frames (points, readings) of a press.
 
-    Its arguments are the places of the tips (points, contacts, 2) m, their slide (2,) m, and parameters of the sheet
-    (points, d): the loads of the tips in N, their progress along the slide, and the temperature in K. ``diameter`` is
-    that of the tips in m. Frames are solved one by one: points come few at a time, and batches of so few take no less
-    time on a CPU.
+    Its arguments are the places of the tips (contacts, 2) m, their slide (2,) m, and parameters of the sheet (points,
+    d): the loads of the tips in N, their progress along the slide, and the temperature in K. ``diameter`` is that of
+    the tips in m. Frames are solved one by one: points come few at a time, and batches of so few take no less time on a
+    CPU.
     """
     frame = je.bind(_frame, model, jnp.asarray(diameter, model.dtype))
 
     def solve(places: np.ndarray, slide: np.ndarray, points: np.ndarray) -> np.ndarray:
         at, way, each = (array.astype(model.dtype) for array in (places, slide, points))
-        return np.stack([frame(tips, way, point) for tips, point in zip(at, each, strict=True)])
+        return np.stack([frame(at, way, point) for point in each])
 
     return solve
 

@@ -1,13 +1,14 @@
 """Frames of the presses of a session: which polynomial gives which frame."""
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from .interpolation import FrameInterpolant, enclosing_boxes, interpolant
 
-SolveEach = Callable[[Int[np.ndarray, " points"], Float[np.ndarray, "points d"]], Float[np.ndarray, "points readings"]]
+SolvePress = Callable[[int, Float[np.ndarray, "points d"]], Float[np.ndarray, "points readings"]]
 
 
 class PressFrames:
@@ -20,7 +21,7 @@ class PressFrames:
 
     def __init__(
         self,
-        solve: SolveEach,
+        solve: SolvePress,
         rest: Float[np.ndarray, " readings"],
         tolerance: float,
         extents: tuple[Float[np.ndarray, "presses phases d"], Float[np.ndarray, "presses phases d"]],
@@ -28,7 +29,7 @@ class PressFrames:
         """Divide the ranges of the parameters into boxes; nothing is solved yet.
 
         Args:
-            solve: frames (points, readings) of presses, by their index (points,), at points (points, d).
+            solve: frames (points, readings) of a press, by its index, at points (points, d).
             rest: frame without contact.
             tolerance: error over the largest change of a press; 0: every frame is solved.
             extents: lowest and highest parameters in each phase of each press; infinite for a phase without samples.
@@ -71,18 +72,14 @@ class PressFrames:
     def _solved(self, press: int, points: Float[np.ndarray, "frames m d"]) -> Float[np.ndarray, "frames readings"]:
         flat, back = np.unique(points.reshape(-1, points.shape[-1]), axis=0, return_inverse=True)
         self.solves += len(flat)
-        solved = self._solve(np.full(len(flat), press), flat)
+        solved = self._solve(press, flat)
         return np.asarray(solved[back.reshape(points.shape[:2]), np.arange(len(self._rest))])
 
     def _polynomial(self, number: int) -> FrameInterpolant:
         """That of a box; those of earlier presses but the last are forgotten."""
         if number not in self._made:
             press = int(self._press[number])
-
-            def solve(points: Float[np.ndarray, "points d"]) -> Float[np.ndarray, "points readings"]:
-                return self._solve(np.full(len(points), press), points)
-
-            made = interpolant(self._boxes[number], solve, self._rest, self._tolerance)
+            made = interpolant(self._boxes[number], partial(self._solve, press), self._rest, self._tolerance)
             self._made = {past: self._made[past] for past in self._made if self._press[past] >= press - 1}
             self._made[number] = made
             self.solves += made.solves

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 import jaxeit as je
 from jaxeit import effects as fx
@@ -230,22 +230,20 @@ class SimulatedEit(AbstractSimulatedStream):
 
     def _resting(self) -> np.ndarray:
         untouched = np.zeros((1, self._parameters))
-        return np.asarray(self._solver(self.motion.places[:1], np.array(self.bench.slide), untouched)[0])
+        return np.asarray(self._solver(self.motion.places[0], np.array(self.bench.slide), untouched)[0])
 
     @property
     def _parameters(self) -> int:
         """Number of parameters of the sheet: load and progress of each tip, and the temperature."""
         return 1 + 2 * int(self.motion.places.shape[1])
 
-    def _solve(
-        self, press: Int[np.ndarray, " points"], points: Float[np.ndarray, "points d"]
-    ) -> Float[np.ndarray, "points readings"]:
-        """Frames of presses at parameters of the sheet; those without a load and a change of temperature are alike."""
+    def _solve(self, press: int, points: Float[np.ndarray, "points d"]) -> Float[np.ndarray, "points readings"]:
+        """Frames of a press at parameters of the sheet; those without a load and a change of temperature are alike."""
         places = self.motion.places[press]
-        changed = points[:, : places.shape[1]].any(1) | (points[:, -1] != 0)
+        changed = points[:, : len(places)].any(1) | (points[:, -1] != 0)
         frames = np.tile(self.resting, (len(points), 1))
         if changed.any():
-            frames[changed] = self._solver(places[changed], np.array(self.bench.slide), points[changed])
+            frames[changed] = self._solver(places, np.array(self.bench.slide), points[changed])
         return frames
 
     def _before(self) -> Any:
