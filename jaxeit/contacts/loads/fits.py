@@ -103,9 +103,14 @@ class FrameFits:
         even = 1 + float(self.belief.model_error) ** 2 * (self.y @ self.y) / len(self.y)
         return np.linalg.cholesky(even * np.eye(len(self.y)) + slopes @ slopes.T)
 
+    def unknowns(self, fit: Fit) -> Unknowns:
+        """Readings of the loads of a fit, and their slopes."""
+        found: Unknowns = unknowns_of(self.belief.sheet, *self.belief.put(fit.loads, fit.forms))
+        return found
+
     def left(self, fit: Fit) -> tuple[np.ndarray, Unknowns]:
         """What a fit leaves of the frame, in units of its errors, and the slopes there."""
-        known = unknowns_of(self.belief.sheet, *self.belief.put(fit.loads, fit.forms))
+        known = self.unknowns(fit)
         return solve_triangular(fit.root, self.y - np.asarray(known.value), lower=True), known
 
     def reach(self, one: Fit) -> np.ndarray:
@@ -124,5 +129,5 @@ class FrameFits:
 
     def known(self, fit: Fit) -> Known:
         """What is known at the loads of a fit."""
-        end = unknowns_of(self.belief.sheet, *self.belief.put(fit.loads, fit.forms))
+        end = self.unknowns(fit)
         return Known(self.y, end, self.errors(end), *self.surprise(fit))
