@@ -124,6 +124,16 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         path = f"write a class of your own as {module + ':' + own!r}"
         return did_you_mean(name, names, path if dot else f"give one of {known}")
 
+    def _hint_of_parts(self, name: str, text: str) -> str:
+        """How to write a name that is one of the objects that settings hold; empty for any other name."""
+        for part in self.parts:
+            if isinstance(part, Registry) and name in (*part.names, *part.words):
+                for own, kind in self.shipped.items():
+                    for setting in settings_of(kind, (part,)).values():
+                        if setting.part is part:
+                            return f"{name!r} is known as {part.kind}: write '{own}:{setting.name}={text}'"
+        return ""
+
     def name_of(self, thing: T | type[T]) -> str:
         """The name of a class or of an object's class; its import path if it is neither shipped nor installed."""
         kind: type = thing if isinstance(thing, type) else type(thing)
@@ -183,6 +193,8 @@ class Registry(Mapping[str, type[T]], Generic[T]):
             ValueError: for a name or a setting that does not exist, or a value of the wrong kind.
         """
         name, settings = split_word(self.words.get(text, text))
+        if name not in self.names and (hint := self._hint_of_parts(name, text)):
+            raise RegistryError(f"no {self.kind} {name!r}; {hint}")
         return _made(
             self.find(name, allow_import), TomlTable(settings, f"{self.kind} {text!r}", allow_import), given, self.parts
         )

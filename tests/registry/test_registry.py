@@ -88,6 +88,13 @@ def test_settings_are_given_in_a_word(registry, text, again):
         (PRIORS, "gaussian-smooth:noser=1", "noser: is 1; give true or false"),
         (BASES, "pixels:columns=0", "Pixels: columns is 0; give 1 to 2000, a whole number"),
         (LOCATORS, "fitted-contact:widths=[1,2,3]", r"give \[a number, a number\] such as \[0.006,0.03\]"),
+        (
+            LOCATORS,
+            "level-centroid:level=0.3",
+            "^no locator 'level-centroid'; 'level-centroid' is known as estimator: write "
+            "'image-centroid:estimator=level-centroid:level=0.3'$",
+        ),
+        (LOCATORS, "half", "write 'image-centroid:estimator=half'$"),
         (HYPERPARAMETERS, "l-curve:frames=1", "frames: unknown key"),
         (CURVES, "linear:bogus=3", "'linear:bogus=3': bogus: unknown key; leave it out: there are no keys$"),
         (EFFECTS, "Noise:stream=eeg", 'give one of "eit", "pressure", "force"'),
