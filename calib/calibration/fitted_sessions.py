@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from .calibration import Calibration
 
 FITTED_NOTE = "the calibration was fitted to this session, so that the errors on other sessions are larger"
+SAME_NOTE = "the calibration was fitted to this session, which tells nothing of what has changed since"
 MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)  # of the hash: an odd number of mixed bits, 2^64 over the golden ratio
 RUN_ROWS = 16  # rows of a stream in a run that is looked for in another session
 RUN_CHANNELS = 4  # first channels that are compared: rounding errors of many would leave no run equal

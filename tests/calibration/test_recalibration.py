@@ -12,7 +12,7 @@ import pytest
 
 import calib
 from calib.calibration import KnownForces, OrdinaryUse, assess
-from calib.calibration.fitted_sessions import is_fitted
+from calib.calibration.fitted_sessions import SAME_NOTE, is_fitted
 from calib.calibration.recalibration.agreement import covariance_of_moves
 from calib.calibration.recalibration.changes import Advice, Evidence, render
 from calib.calibration.recalibration.image_reference import fit_reference
@@ -26,6 +26,7 @@ from calib.fitting.pad_gains import PadGains
 from calib.fitting.pads import PadModel
 from calib.live.engine import Engine, ReceivedFrame
 from calib.live.recalibrator import LiveRecalibrator
+from calib.presses.table import measure
 from calib.session import read_archive
 
 from .weeks import SLOPE, S, rough_sensitivity
@@ -168,6 +169,23 @@ def test_a_session_moves_a_calibration_once(moved, ten):
         with pytest.raises(calib.SessionError, match=r"ten\.h5: has moved this calibration before; .* that is new"):
             calib.recalibrate(moved, session)
         assert is_fitted(moved.provenance, session)
+
+
+@pytest.mark.parametrize("listed", [True, False], ids=["file", "presses"])
+def test_a_session_that_a_calibration_was_fitted_to_is_named(calibration, ten, listed):
+    """By its file, or written again under another identity by the presses it holds."""
+    with calib.open_session(ten) as session:
+        assert SAME_NOTE not in calib.recalibrate(calibration, session).notes
+        if listed:
+            fitted = replace(calibration, provenance=calibration.provenance | {"sessions": f"{session.hash}  ten.h5"})
+        else:
+            found = measure(session, calibration.skin, calibration.processing)
+            own, known, pressure = calibration.evaluation, found.force, calibration.own_pressures(found.pressure)
+            share = pressure / pressure.sum(1, keepdims=True)
+            first = {"force": known, "pressure": pressure, "pad_force": share * known[:, None]}
+            own = replace(own, **{name: np.r_[rows, getattr(own, name)[10:]] for name, rows in first.items()})
+            fitted = replace(calibration, evaluation=own)
+        assert SAME_NOTE in calib.recalibrate(fitted, session).notes
 
 
 # --- ordinary use ----------------------------------------------------------------------------------------------------

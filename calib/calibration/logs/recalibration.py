@@ -9,7 +9,7 @@ from ...check.acceptance import accept
 from ...fitting.gain_update import GainDrift
 from ...fitting.logs import series_of
 from ...session import Session, SessionError
-from ..fitted_sessions import require_not_moved_by
+from ..fitted_sessions import SAME_NOTE, is_fitted, require_not_moved_by
 from .calibration import LogCalibration
 from .procedure import log_of, place_of, stream_of
 from .shift import LogShift, fit_shift, full_scale_of, shift_prior
@@ -46,7 +46,11 @@ def assess_log(
         session=f"{session.hash}  {session.name}",
         since=calibration.recorded,
         until=session.epoch,
-        notes=(*ignored, *_left_out(series.complete, found.valid)),
+        notes=(
+            *([SAME_NOTE] if is_fitted(calibration.provenance, session) else []),
+            *ignored,
+            *_left_out(series.complete, found.valid),
+        ),
     )
 
 

@@ -28,7 +28,7 @@ from ...presses.table import measure, require_skin
 from ...session import Session, SessionError
 from ...session.given import require_session
 from ..calibration import Calibration
-from ..fitted_sessions import require_not_moved_by
+from ..fitted_sessions import SAME_NOTE, holds_presses, is_fitted, require_not_moved_by
 from ..force_maps import USED_PARTS, ForceModel, force_model, unmoved_forces
 from ..given import require_calibration
 from ..localisation.press_images import Imager
@@ -320,7 +320,15 @@ def assess(
         )
     way = evidence or (KnownForces() if "force" in session.streams else OrdinaryUse())
     loads, notes = way.read(calibration, session, ignore_errors)
-    return judge(calibration, way, loads, session, [*other_skin(calibration, session), *notes])
+    same = [SAME_NOTE] if _is_known(calibration, way, loads, session) else []
+    return judge(calibration, way, loads, session, [*same, *other_skin(calibration, session), *notes])
+
+
+def _is_known(calibration: Calibration, way: AbstractEvidence, loads: LoadedPads, session: Session) -> bool:
+    """Whether a calibration was fitted to a session, or to most of its presses of known force."""
+    if is_fitted(calibration.provenance, session):
+        return True
+    return way.kind is Evidence.KNOWN_FORCE and holds_presses(calibration, np.exp(loads.observed), loads.pressure)
 
 
 def judge(

@@ -1,6 +1,7 @@
 """A log a week later: gain and offset of a sensor without EIT, from known force, with honest errors."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from scipy import signal
 
 import calib
 from calib.calibration import assess_log, recalibrate_log
+from calib.calibration.fitted_sessions import SAME_NOTE
 from calib.calibration.logs.procedure import calibrate_logs, evaluate_log
 from calib.calibration.logs.shift import fit_shift, shift_prior
 from calib.cli import main
@@ -92,6 +94,14 @@ def test_a_second_recalibration_starts_from_the_first(made):
     np.testing.assert_allclose(again.shift.before, [moved.shift.gain, moved.shift.offset])
     assert "no need to recalibrate" in again.shift.health
     assert len(again.provenance["recalibrations"].splitlines()) == 2
+
+
+def test_a_log_that_a_calibration_was_fitted_to_is_named(made):
+    calibration, _, later, _ = made
+    with open_session(later) as session:
+        own = replace(calibration, provenance=calibration.provenance | {"sessions": f"{session.hash}  log.h5"})
+        assert SAME_NOTE in recalibrate_log(own, session).shift.notes
+        assert SAME_NOTE not in recalibrate_log(calibration, session).shift.notes
 
 
 def test_a_log_at_rest_does_not_tell_the_gain(made, tmp_path):
