@@ -38,10 +38,12 @@ from .hysteresis_loops import typical_loops
 from .layer import learn_layer
 from .localisation.electrode_places import PlacedElectrodes, place_electrodes
 from .localisation.locators import ContactLocator
+from .localisation.place_doubts import correction_that_harms, no_better_than_a_guess, require_on_sheet
 from .localisation.press_images import Imager, PressImages, prepare_imager
 from .logs.calibration import LogCalibration
 from .logs.evaluation import LogEvaluation
 from .logs.procedure import evaluate_log
+from .own_classes import import_note
 from .press_examples import press_examples, press_probes
 from .recalibration.agreement import agreement_of_presses
 from .recipe import Recipe, recipe_or_default
@@ -73,7 +75,8 @@ def calibrate(
     Raises:
         SessionError: a session cannot be used, is given twice, or was recorded on another skin.
         RecordingError: `check_session` finds an error in a session.
-        FitError: a pad was not pressed enough to fit its curve, or there are too few presses for a field.
+        FitError: a pad was not pressed enough to fit its curve, there are too few presses for a field, or a class of
+            your own returns what cannot be, such as places off the sheet.
         InverseError, HyperparameterError: no image can be made as the recipe asks.
     """
     sessions = sessions_of(sessions, "calibrate")
@@ -137,6 +140,7 @@ def _found(skin: je.Skin, presses: PooledPresses, recipe: Recipe, progress: Call
     progress("model and images")
     imager = prepare_imager(skin, presses, recipe)
     images = imager.presses(presses.dv)
+    require_on_sheet(skin, images.places, recipe.locator)
     progress("fitting")
     stage = presses.position if any(field is not None and field.steady for field in recipe.locations) else None
     folds = fold_presses(skin, presses.data, images.places, recipe.loss, recipe.folds, stage)
@@ -150,13 +154,14 @@ def _found(skin: je.Skin, presses: PooledPresses, recipe: Recipe, progress: Call
 def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ignored: tuple[str, ...]) -> Calibration:
     presses, imager, response = found.presses, found.imager, found.response
     choice, model = response.choice, with_error_scale(response.model, found.held_out.error_scale)
+    evaluation = _held_out_evaluation(found)
     return Calibration(
         skin=found.skin,
         recon=imager.recon,
         masks=imager.masks,
         curves=model.curves,
-        notes=(*ignored, *_notes(found)),
-        evaluation=_held_out_evaluation(found),
+        notes=(*ignored, *_notes(found, evaluation)),
+        evaluation=evaluation,
         provenance=_provenance(sessions, recipe, imager, response, ignored),
         simulated=any(s.simulated for s in sessions),
         field=model.field,
@@ -176,10 +181,12 @@ def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ign
     )
 
 
-def _notes(found: _Found) -> tuple[str, ...]:
+def _notes(found: _Found, evaluation: Evaluation) -> tuple[str, ...]:
     """What the operator should know of the stages."""
     presses, choice = found.presses, found.response.choice
     unpressed = unpressed_note(found.response.model.field, found.images.places, presses.data.share)
+    harm = correction_that_harms(evaluation) if found.response.model.field is not None else ""
+    needed = import_note(choice.curve, choice.field, found.imager.locator)
     return (
         *presses.notes,
         *([found.placed.note] if found.placed else []),
@@ -187,7 +194,7 @@ def _notes(found: _Found) -> tuple[str, ...]:
         *([f"chosen: {choice.why}"] if choice.why else []),
         *_not_predicted(found.skin, found.held_out.pad_force),
         *_contradictions(found),
-        *filter(None, [unpressed]),
+        *filter(None, [unpressed, harm, needed]),
     )
 
 
@@ -195,7 +202,10 @@ def _contradictions(found: _Found) -> tuple[str, ...]:
     """What presses contradict: single ones the others, pads that drift, and places of a stage that is off."""
     presses, held_out, seen = found.presses, found.held_out.pad_force, found.images.estimated.get("fitted")
     names, corrected = [pad.name for pad in found.skin.pads], found.response.model.field is not None
+    guessed = no_better_than_a_guess(presses.position, seen)
+    seen = None if guessed else seen  # places that tell nothing contradict nobody
     return (
+        *filter(None, [guessed]),
         *contradicted_presses(presses, held_out.sum(1), seen),
         *drifting_pads(presses, names, held_out, by_place=corrected),
         *(moved_places(presses, seen) if seen is not None and isinstance(found.imager.locator, ContactLocator) else ()),

@@ -21,6 +21,7 @@ from jaxeit.kinds import require_kind
 from jaxeit.registry import Registry, SettingError, limited, require_limits
 
 from ...fitting.fields import Places, single_places
+from ...fitting.results import FitError
 
 
 class AbstractLocator(eqx.Module):
@@ -46,7 +47,18 @@ class CentroidLocator(AbstractLocator):
     estimator: je.metrics.AbstractEstimator
 
     def __call__(self, dv: Array, image: Array, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks) -> Places:
-        return single_places(self.estimator(image, recon), masks.weights.shape[0])
+        return single_places(self._position(image, recon), masks.weights.shape[0])
+
+    def _position(self, image: Array, recon: je.imaging.AbstractReconstructor) -> Array:
+        """The positions (n, 2) m of images (n, pixels) S; FitError for results of another shape."""
+        found, shape = self.estimator(image, recon), (*image.shape[:-1], 2)
+        if getattr(found, "shape", None) != shape:
+            what = f"of shape {found.shape}" if hasattr(found, "shape") else f"of type {type(found).__name__}"
+            raise FitError(
+                f"{type(self.estimator).__name__}.__call__ returns a result {what} for images of shape {image.shape}; "
+                f"return {shape}, x and y in m of each image"
+            )
+        return found
 
 
 class ContactLocator(AbstractLocator):
