@@ -21,7 +21,7 @@ Example:
     print(f"{fmap.force.sum():.1f} N; the image shows where on pads {jnp.flatnonzero(fmap.valid)}")
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -300,7 +300,17 @@ def fuse(
     errors = None if pad_errors is None else real_array("pad_errors", pad_errors, FusionError)
     if errors is not None and errors.shape[-1:] != (pads,):
         raise FusionError(f"pad_errors has shape {errors.shape}; give a standard error, N, of each of {pads} pads")
+    _require_one_batch({"image": image, "pad_forces": forces} | ({} if errors is None else {"pad_errors": errors}))
     return _fused(image, masks, forces, jnp.asarray(gate, masks.areas.dtype), contacts, errors)
+
+
+def _require_one_batch(arrays: Mapping[str, Array]) -> None:
+    """Raise FusionError unless the leading axes of arrays, which count the images of a batch, broadcast."""
+    try:
+        np.broadcast_shapes(*(array.shape[:-1] for array in arrays.values()))
+    except ValueError:
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        raise FusionError(f"{shapes}: give pad forces for as many images, or for one") from None
 
 
 def require_gate(gate: Float[ArrayLike, ""]) -> None:

@@ -1,6 +1,7 @@
 """What stands in the place of something else: a name, a path, a class, or an object of another kind."""
 
 import os
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -40,3 +41,19 @@ def require_kind(
     """
     if not isinstance(value, kinds):
         raise error(f"{where}{where and ': '}{stated(value)} is not {what}; give {give}")
+
+
+def require_unmasked(given: Mapping[str, Any], error: type[Exception], fill: str = "numpy.nan") -> None:
+    """Refuse arrays of `numpy.ma`: an array of NumPy would hold what they mask as if measured, and JAX takes none.
+
+    Args:
+        given: the values by their names.
+        error: type of the error.
+        fill: what stands for a missing value here.
+
+    Raises:
+        error: "<name> is a masked array, whose mask would be lost; give <name>.filled(<fill>)".
+    """
+    for name, values in given.items():
+        if np.ma.isMaskedArray(values):
+            raise error(f"{name} is a masked array, whose mask would be lost; give {name}.filled({fill})")

@@ -133,6 +133,10 @@ def test_shapes_that_do_not_fit_are_refused(skin, model, pixels, masks):
         ({"pad_errors": np.ones(3)}, r"pad_errors has shape \(3,\); give a standard error, N, of each of 4 pads"),
         ({"image": np.full(400, 1j)}, "image is complex"),
         (
+            {"image": np.zeros((3, 400)), "pad_forces": np.zeros((2, 4))},
+            r"^image \(3, 400\), pad_forces \(2, 4\): give pad forces for as many images, or for one$",
+        ),
+        (
             {"masks": np.ones((4, 400))},
             r"fuse: ndarray is not masks of pads; give those of jaxeit.pad_masks\(skin, recon",
         ),

@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 import jaxeit as je
+from jaxeit.kinds import require_unmasked
 from jaxeit.notebook import card
 from jaxeit.tracking import ContactLaw, LearnedLayer
 
@@ -229,7 +230,8 @@ class Calibration:
 
 
 def real_rows(values: ArrayLike, name: str) -> np.ndarray:
-    """Rows of real numbers, of which one may stand by itself; ValueError for complex numbers and for no numbers."""
+    """Rows of real numbers, of which one may stand by itself; ValueError for complex, masked and no numbers."""
+    require_unmasked({name: values}, ValueError)
     rows = np.atleast_2d(values)
     if rows.dtype.kind not in "iufb":
         part = f"; of complex {name} give the real part" if rows.dtype.kind == "c" else ""

@@ -291,6 +291,9 @@ class SessionWriter(FileWriter):
         self, name: str, stream: _Stream, times: np.ndarray, values: ArrayLike
     ) -> tuple[np.ndarray, np.ndarray]:
         """Values as stored (n, channels), and the flags that storing them gave rise to (n,)."""
+        if np.ma.isMaskedArray(values):
+            what = "values of a masked array, whose mask would be lost"
+            raise self._problem(f"/streams/{name}", what, "give values.filled(numpy.nan): NaN counts as missing")
         values = np.asarray(values, np.float64)
         if values.ndim == 1:
             values = values.reshape(len(times), -1) if len(times) else values.reshape(0, 1)

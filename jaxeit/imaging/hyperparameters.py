@@ -19,7 +19,7 @@ from .._compile import verb
 from ..linalg.lapack import eigh
 from ..registry import AbstractChoice, Registry, limited
 from .methods import Problem
-from .noise import InverseError
+from .noise import InverseError, require_real
 
 # Takes frames, (..., readings) V, to whitened ones, (..., k).
 Whiten = Callable[[Array], Array]
@@ -105,7 +105,10 @@ class AbstractFrameChoice(AbstractHyperparameter):
     frames: eqx.AbstractVar[Float[ArrayLike, "... readings"] | None]
 
     def on(self, frames: Float[ArrayLike, "... readings"]) -> "AbstractFrameChoice":
-        return self if self.frames is not None else replace(self, frames=jnp.asarray(frames))
+        if self.frames is not None:
+            return self
+        require_real(frames=frames)
+        return replace(self, frames=jnp.asarray(frames))
 
     def whitened(self, whiten: Whiten) -> Float[Array, "... k"]:
         """The frames, whitened.
@@ -116,6 +119,7 @@ class AbstractFrameChoice(AbstractHyperparameter):
         if self.frames is None:
             name = type(self).__name__
             raise HyperparameterError(f"{name} looks at frames of a touch and has none; give {name}(frames)")
+        require_real(frames=self.frames)
         return _changes(jnp.asarray(self.frames), whiten)
 
 

@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
 from ..registry import Registry
-from .noise import InverseError, noise_covariance
+from .noise import InverseError, noise_covariance, require_real
 
 LEAST_DEVIATION = 0.1  # of the median deviation: a reading that hardly changes is not trusted more than tenfold
 
@@ -116,6 +116,7 @@ def _used(
     """Readings that are used, (readings,), and the frames that have all of them."""
     if quiet is None:
         raise InverseError(f"{type(noise).__name__} is measured; give frames without contact (quiet=), or EqualNoise()")
+    require_real(quiet=quiet)
     frames = np.asarray(quiet, float)
     used = np.ones(frames.shape[1], bool) if channels is None else np.asarray(channels, bool)
     frames = frames[:, used]

@@ -28,7 +28,7 @@ from scipy.linalg.lapack import dpstrf
 from .._compile import is_traced, require_known
 from ..budget import require
 from ..effects import AbstractTerminalEffect, CommonMode, chosen
-from ..kinds import stated
+from ..kinds import require_unmasked, stated
 from ..linalg.array_libraries import JAX, NUMPY, ArrayLibrary
 from ..model.discretisation import Model
 from ..model.mixing import Mixing, matrix_of_rows, padded_rows
@@ -316,6 +316,7 @@ def known_flags(channels: Any, readings: int) -> np.ndarray:
 
 def as_flags(channels: Any, readings: int) -> Any:
     """One flag per reading; of JAX where it traces them, else of NumPy."""
+    require_unmasked({"channels": channels}, InverseError, "False")
     flags = channels.astype(bool) if is_traced(channels) else np.asarray(channels, bool)
     if flags.shape != (readings,):
         raise InverseError(f"channels has shape {flags.shape}; this model has {readings} readings")
@@ -330,19 +331,22 @@ def require_frames(dv: Float[ArrayLike, "..."], readings: int) -> None:
 
 
 def require_real(**frames: Any) -> None:
-    """Refuse frames of texts, and complex ones: a conversion to float would leave out the imaginary part silently."""
+    """Refuse frames of texts, masked frames, and complex ones: a conversion to float would leave out the mask, or the
+    imaginary part, silently."""
+    require_unmasked(frames, InverseError)
     for name, frame in frames.items():
         if not hasattr(frame, "dtype") and is_traced(frame):
             continue  # a list of hidden numbers
         kind = (frame if hasattr(frame, "dtype") else _array_of(frame)).dtype.kind
         if kind == "c":
             raise InverseError(f"{name} is complex, and a model is real; give {name}.real, or {name}.imag by itself")
-        if kind in NO_NUMBERS:
+        if kind in NO_NUMBERS + "b":
             raise InverseError(f"{name} is {stated(frame)}; give real numbers, V")
 
 
 def real_numbers(name: str, values: Any, unit: str) -> np.ndarray:
-    """Values that are known, as an array of float64; refused unless they are real numbers."""
+    """Values that are known, as an array of float64; refused unless they are real numbers, none of them masked."""
+    require_unmasked({name: values}, InverseError)
     found = _array_of(values)
     if found.dtype.kind in NO_NUMBERS:
         kind = "complex" if found.dtype.kind == "c" else stated(values)

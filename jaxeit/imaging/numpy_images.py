@@ -42,8 +42,8 @@ class NumpyImages:
 
     def __call__(self, dv: Float[np.ndarray, "... readings"]) -> Float[np.ndarray, "... basis"]:
         """The images of these frames."""
-        dv = np.asarray(dv)
         require_frames(dv, len(self._used))
+        dv = np.asarray(dv)
         if dv.ndim > 1:
             batch = dv.shape[:-1]
             return self._batch(dv.reshape(prod(batch), dv.shape[-1])).reshape(*batch, len(self._factor))

@@ -10,7 +10,7 @@ import scipy.linalg
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from ..kinds import stated
+from ..kinds import require_unmasked, stated
 from . import lapack
 
 
@@ -68,8 +68,9 @@ def real_array(name: str, values: Any, error: type[Exception]) -> Array:
     """Values as an array of JAX, also where jit, grad or vmap hides them.
 
     Raises:
-        error: unless they are real numbers; ``name`` names them.
+        error: unless they are real numbers, none of them masked; ``name`` names them.
     """
+    require_unmasked({name: values}, error)
     try:
         found = jnp.asarray(values)
     except (TypeError, ValueError):

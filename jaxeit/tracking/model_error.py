@@ -11,7 +11,8 @@ from jaxtyping import Float
 
 from .._compile import require_known
 from ..contacts.loads.learned.model_error import fitted_model_error
-from ..imaging.noise import InverseError
+from ..imaging.noise import InverseError, require_real
+from ..kinds import require_unmasked
 from .belief.filter import Pads
 from .belief.layer import LearnedLayer
 from .looks import has_ended
@@ -79,6 +80,8 @@ def press_evidence(
 def _seen(
     tracker: Tracker, dv: ArrayLike, pad_forces: ArrayLike | None, pad_errors: ArrayLike | None
 ) -> list[tuple[np.ndarray, Pads]]:
+    require_real(dv=dv)
+    require_unmasked({"pad_forces": pad_forces, "pad_errors": pad_errors}, InverseError)
     frames = np.asarray(dv, float)
     if frames.ndim != 2 or not len(frames):
         raise InverseError(f"dv has shape {frames.shape}; give one frame or more, (n, readings)")

@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float
 
 from .._compile import require_known
 from ..imaging.absolute.background import UntouchedSheet, fitted_sheet, untouched_frame
-from ..imaging.noise import InverseError
+from ..imaging.noise import InverseError, require_real
+from ..kinds import require_unmasked
 from ..model.discretisation import Model, require_model
 from ..skin.description import Skin
 from .belief.consider import ConsiderErrors
@@ -285,6 +286,7 @@ class Tracker:
 
     def frame(self, dv: Float[ArrayLike, " readings"]) -> Float[np.ndarray, " readings"]:
         """A frame as the programs take it; raises InverseError if it has another shape."""
+        require_real(dv=dv)
         frame, readings = np.asarray(dv, self.filter.places.dtype), self.filter.finder.readings
         if frame.shape != (readings,):
             raise InverseError(f"dv has shape {frame.shape}; give one frame of {readings} readings")
@@ -295,6 +297,7 @@ class Tracker:
         count = self.filter.sheet.pad_area.shape[1]
         if forces is None:
             return Pads(np.zeros(count), np.full(count, np.inf))
+        require_unmasked({"pad_forces": forces, "pad_errors": errors}, InverseError)
         force, error = np.asarray(forces, float), np.asarray(errors, float)
         if force.shape != (count,) or error.shape != (count,):
             raise InverseError(

@@ -107,6 +107,8 @@ def test_what_is_no_change_of_frames_and_pads_is_named(calibration):
     frames, pads = np.zeros((2, calibration.recon.readings)), np.zeros((2, 4))
     with pytest.raises(ValueError, match=r"frames hold complex128: give real numbers; of complex frames give the real"):
         calib.force_map(calibration, frames + 1j, pads)
+    with pytest.raises(ValueError, match=r"pressures is a masked array"):
+        calib.force_map(calibration, frames, np.ma.masked_equal(pads, 0))
     with pytest.raises(ValueError, match=r"before \(3, 3\) do not fit this calibration: give \(n, 4\) Pa"):
         calib.force_map(calibration, frames, pads, before=np.zeros((3, 3)))
     with pytest.raises(je.fusion.FusionError, match=r"gate is -3"):

@@ -304,6 +304,11 @@ def test_frames_of_another_length_are_refused(finder):
         finder(np.zeros(549))
 
 
+def test_masked_frames_are_refused(finder):
+    with pytest.raises(InverseError, match="dv is a masked array"):
+        finder(np.ma.masked_equal(np.zeros(550), 0))
+
+
 def test_complex_frames_are_refused(finder, model):
     """JAX would leave out their imaginary part with a warning."""
     frame = 1j * np.ones(finder.readings)

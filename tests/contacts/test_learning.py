@@ -186,6 +186,8 @@ def test_presses_that_tell_no_law_are_refused(ready):
         learn_loads(model, frames, PLACES[:6], FORCES, noise=noise)
     with pytest.raises(InverseError, match=r"press 2 has place .* force 0.0 N"):
         learn_loads(model, frames, PLACES, np.where(np.arange(7) == 2, 0.0, FORCES), noise=noise)
+    with pytest.raises(InverseError, match="force is a masked array"):
+        learn_loads(model, frames, PLACES, np.ma.masked_equal(FORCES, FORCES[2]), noise=noise)
     with pytest.raises(InverseError, match="press 4 has place"):
         learn_loads(model, frames, np.where(np.arange(7)[:, None] == 4, np.nan, PLACES), FORCES, noise=noise)
     with pytest.raises(InverseError, match="learn_loads decides by looking at values"):

@@ -124,6 +124,8 @@ def test_a_file_gives_the_same_proposal(proposal, skin, tmp_path):
     proposal.save(path)
     found = load_proposal(path)
     np.testing.assert_array_equal(found(dv).probability, proposal(dv).probability)
+    with pytest.raises(InverseError, match="dv is a masked array"):
+        found(np.ma.masked_invalid(dv))
     found.save(tmp_path / "again.npz")
     assert (tmp_path / "again.npz").read_bytes() == path.read_bytes()
     found.require_skin(skin)

@@ -321,6 +321,7 @@ def test_wrong_shapes_and_weights_are_refused_in_one_line():
         (lambda: fit_curves(Linear(), p, f, groups=f[:3]), "groups has shape"),
         (lambda: fit_curves(Linear(), p, f, sigma=0.0), "above zero"),
         (lambda: fit_curves(Linear(), p.astype(str), f), "must be numbers"),
+        (lambda: fit_curves(Linear(), np.ma.masked_equal(p, 1), f), "pressures is a masked array"),
         (lambda: fit_curve(Linear(), p, f), "pressure and force"),
     ]:
         with pytest.raises(FitError, match=text):

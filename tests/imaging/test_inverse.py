@@ -61,7 +61,7 @@ def test_a_touch_is_found_where_it_is(model, recon):
     assert float(je.metrics.image_sum(image, recon.areas)) > 0
 
 
-@pytest.mark.parametrize("frame", ["x", ["a"] * 550, np.full(550, "1.0")])
+@pytest.mark.parametrize("frame", ["x", ["a"] * 550, np.full(550, "1.0"), np.ones(550, bool)])
 def test_a_frame_of_texts_is_refused_in_one_line(model, frame):
     frames = [je.imaging.fit_background, je.imaging.fit_reference, je.imaging.absolute_image]
     for call in (*frames, je.imaging.find_misplacement):

@@ -405,6 +405,7 @@ REFUSED_WRITES: dict[str, tuple[Callable[[SessionWriter], object], str]] = {
     "back in time": (lambda w: w.append("eit", [5, 4], np.zeros((2, 3))), "at row 1"),
     "equal times": (lambda w: w.append("eit", [5, 5], np.zeros((2, 3))), "at row 1"),
     "float times": (lambda w: w.append("eit", [5.0, 6.0], np.zeros((2, 3))), "2 integers"),
+    "mask": (lambda w: w.append("eit", [5], np.ma.masked_equal([[1.0, 2.0, 3.0]], 2)), "values.filled(numpy.nan)"),
     "shape": (lambda w: w.append("eit", [5, 6], np.zeros((2, 4))), "(2, 3)"),
     "unknown stream": (lambda w: w.append("eat", [5], np.zeros((1, 3))), "add_stream first"),
     "flags": (lambda w: w.append("eit", [5], np.zeros((1, 3)), status=[1 << 20]), "does not fit"),

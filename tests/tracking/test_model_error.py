@@ -136,6 +136,11 @@ def test_frames_of_another_shape_are_refused(tracker, dv):
         fit_model_error(tracker, dv)
 
 
+def test_masked_frames_are_refused(tracker, presses):
+    with pytest.raises(InverseError, match="dv is a masked array"):
+        fit_model_error(tracker, np.ma.masked_invalid(presses))
+
+
 @pytest.mark.parametrize("function", [fit_model_error, press_evidence])
 def test_frames_that_jit_hides_are_refused(tracker, presses, function):
     with pytest.raises(InverseError, match=f"{function.__name__} decides by looking at values"):

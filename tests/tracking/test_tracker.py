@@ -206,6 +206,8 @@ def test_a_belief_moves_by_the_integrated_random_walk(tracker, followed):
     ("given", "said"),
     [
         ({"dv": np.zeros(3)}, "550 readings"),
+        ({"dv": np.ma.masked_equal(np.zeros(550), 0)}, "dv is a masked array"),
+        ({"pad_forces": np.ma.masked_equal(np.ones(4), 1), "pad_errors": np.ones(4)}, "pad_forces is a masked array"),
         ({"seconds": 0.0}, "above zero"),
         ({"pad_forces": np.zeros(4), "pad_errors": np.zeros(4)}, "standard error zero"),
         ({"pad_forces": np.zeros(3), "pad_errors": np.ones(3)}, r"give \(4,\)"),

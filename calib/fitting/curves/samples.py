@@ -9,6 +9,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxeit.kinds import require_unmasked
+
 from ..results import FitError
 
 Numbers = ArrayLike | Sequence[Any]
@@ -84,6 +86,7 @@ def _numbers(values: Any, what: str, dtype: Any) -> np.ndarray:
     """An array of `dtype` (None: the precision of the values). A silent loss of precision is refused."""
     if dtype is not None and jax.dtypes.canonicalize_dtype(dtype) != np.dtype(dtype):
         raise FitError("dtype is float64 but JAX has 64-bit numbers off; set JAX_ENABLE_X64=1 or give float32.")
+    require_unmasked({what: values}, FitError)
     array = np.asarray(values)
     if array.dtype.kind not in "fiu":
         raise FitError(f"{what} must be numbers, not {array.dtype}.")

@@ -22,7 +22,7 @@ from ...model.discretisation import Model
 from ...model.forward_model import forward, terminal_matrix, voltages
 from ...model.sensitivity import field_jacobian, scaled_jacobian, solved_fields
 from ...registry import AbstractChoice, limited
-from ..noise import InverseError
+from ..noise import InverseError, require_real
 from ..priors import AbstractPrecision
 from .frames import checked_errors, require_steps
 
@@ -249,6 +249,7 @@ def _image_posterior(
     std: Float[Array, " readings"],
 ) -> ImagePosterior:
     """The posterior of an image, from readings and their errors, V; raises InverseError for what are none."""
+    require_real(readings=readings)
     values = jnp.asarray(readings)
     if values.shape != (physics.model.readings,):
         raise InverseError(

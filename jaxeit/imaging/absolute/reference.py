@@ -32,7 +32,7 @@ from ...model.forward_model import forward
 from ...model.motion import Motion, electrode_motion, moved
 from ...registry import limited, require_limits
 from ...registry.limits import LONGEST
-from ..noise import ConvergenceError, InverseError
+from ..noise import ConvergenceError, InverseError, require_real
 from .frames import MAX_UNEXPLAINED, checked_errors, checked_frame, frame_error, require_explained, sheet_level
 from .images import reading_weights
 
@@ -128,6 +128,7 @@ class ReferenceFit(eqx.Module):
 
     def corrected(self, frames: Float[ArrayLike, "... readings"]) -> Float[Array, "... readings"]:
         """Frames, V, as the model reads them: without the gains, the offsets and the scale that were fitted."""
+        require_real(frames=frames)
         readings = jnp.asarray(frames, self.model.dtype)
         if self.channel is not None:
             readings = (readings - self.value.offset[self.channel]) / (1 + self.value.gain[self.channel])

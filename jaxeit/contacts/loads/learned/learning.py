@@ -33,7 +33,8 @@ from jaxtyping import Array, Bool, Float
 from scipy.linalg import solve_triangular
 
 from ...._compile import require_known
-from ....imaging.noise import InverseError
+from ....imaging.noise import InverseError, require_real
+from ....kinds import require_unmasked
 from ....model.discretisation import Model
 from ..belief import LoadBelief
 from ..comparison import log_evidence
@@ -114,6 +115,8 @@ def learn_loads(
         print(learned.changed())
     """
     require_known("learn_loads", InverseError, dv, position, force)
+    require_real(dv=dv)
+    require_unmasked({"position": position, "force": force}, InverseError)
     frames, places, forces = (np.asarray(values, float) for values in (dv, position, force))
     _require_presses(frames, places, forces)
     usual = replace(settings or LoadSettings(), forces=ForceLaw())

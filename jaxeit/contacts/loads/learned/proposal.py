@@ -18,7 +18,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
 from ....array_files import read_arrays, write_arrays
-from ....imaging.noise import InverseError
+from ....imaging.noise import InverseError, require_real
+from ....kinds import require_unmasked
 from ....skin import Skin, skin_hash
 from ..pressure import FORMS
 from ..result import LoadKind, Proposed
@@ -109,6 +110,8 @@ class Proposal:
         Raises:
             InverseError: if the frame has another number of readings, or the pads another number of forces.
         """
+        require_real(dv=dv)
+        require_unmasked({"pad_forces": pad_forces}, InverseError)
         dv = np.asarray(dv, float)
         if dv.ndim == 0 or dv.shape[-1] != len(self.basis):
             raise InverseError(f"dv has shape {dv.shape}; the proposal is for frames of {len(self.basis)} readings")
