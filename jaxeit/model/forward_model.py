@@ -323,6 +323,12 @@ def series_resistance(system: System, theta: Coefficients) -> Float[Array, " ele
     return jnp.where(lumped, resistance, 0.0)
 
 
+def series_slopes(system: System, theta: Coefficients) -> Float[Array, "electrodes elements"]:
+    """Derivative of `series_resistance` with respect to the conductivity of each element, ohm/S."""
+    found: Array = jax.jacrev(lambda sigma: series_resistance(system, theta._replace(sigma=sigma)))(theta.sigma)
+    return found
+
+
 def terminal_matrix(model: Model, theta: Coefficients, x: Fields) -> Float[Array, "electrodes electrodes"]:
     """The transfer matrix Z in ohm, from the fields x at theta."""
     return x.terminal + jnp.diag(series_resistance(model.system, theta))
@@ -464,8 +470,8 @@ def _grounded(system: System, values: Float[Array, " nnz"]) -> tuple[Float[Array
 def energy(model: Model, theta: Coefficients, x: Fields) -> Float[Array, "a b"]:
     """``A(theta; x_a, x_b)`` for all pairs of fields, in ohm."""
     system = model.system
-    slopes = jnp.einsum("ekr,eka->era", system.slopes, x.potential[system.dofs])
-    sheet = jnp.einsum("era,erb->ab", theta.sigma[:, None, None] * slopes, slopes)
+    gradients = system.gradients(x.potential)
+    sheet = jnp.einsum("era,erb->ab", theta.sigma[:, None, None] * gradients, gradients)
     drop = x.drop[system.contact_dofs]
     mass = theta.contact[system.contact_electrode][:, None, None] * system.contact_mass
     own = sheet + jnp.einsum("pia,pij,pjb->ab", drop, mass, drop)

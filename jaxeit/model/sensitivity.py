@@ -29,6 +29,7 @@ from .forward_model import (
     energy,
     fields,
     series_resistance,
+    series_slopes,
     terminal_matrix,
     voltages,
 )
@@ -159,12 +160,12 @@ def element_slopes(
     few elements, ohm/S, from the fields at theta."""
     first, second = jnp.asarray(pairs).T
     system = model.system
-    slopes = jnp.einsum("ekr,eka->era", system.slopes[element], potential[system.dofs[element]])
-    products = jnp.sum(slopes[..., first] * slopes[..., second], 1)
+    gradients = system.gradients(potential, element)
+    products = jnp.sum(gradients[..., first] * gradients[..., second], 1)
     if not system.near_element.size:
         return -products
-    series = jax.jacrev(lambda sigma: series_resistance(system, theta._replace(sigma=sigma)))(theta.sigma)
-    return jnp.where(first == second, series[:, element].T[:, first], 0) - products
+    series = series_slopes(system, theta)[:, element]
+    return jnp.where(first == second, series.T[:, first], 0) - products
 
 
 def _pair_slopes(
@@ -209,8 +210,8 @@ def _by_elements(
     size = min(len(weights), max(1, BATCH_ELEMENTS // image.element.shape[1]))
 
     def line(element: Int[Array, " e"], weight: Float[Array, " e"]) -> Float[Array, " k"]:
-        slopes = jnp.einsum("ekr,eka->era", system.slopes[element], potential[system.dofs[element]])
-        return jnp.einsum("e,era,erb->ab", weight, slopes, slopes)[first, second]
+        gradients = system.gradients(potential, element)
+        return jnp.einsum("e,era,erb->ab", weight, gradients, gradients)[first, second]
 
     found = jax.lax.map(lambda table: line(*table), (image.element, weights), batch_size=size)
     return jnp.zeros((image.size, len(first)), potential.dtype).at[image.coefficient].add(found)
@@ -222,5 +223,5 @@ def _series_slopes(
     """Derivative of the contact resistances in closed form, each of which depends on few elements."""
     if not model.system.near_element.size:
         return jnp.zeros((model.electrodes, image.size), model.dtype)
-    slopes = jax.jacrev(lambda sigma: series_resistance(model.system, theta._replace(sigma=sigma)))(theta.sigma)
+    slopes = series_slopes(model.system, theta)
     return jax.vmap(image.restrict)(slopes if scale is None else scale * slopes)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Integer
 
@@ -84,6 +85,13 @@ class System(eqx.Module):
     def unknowns(self) -> int:
         """Number of unknowns solved for."""
         return self.under.shape[0]
+
+    def gradients(
+        self, potential: Float[Array, "unknowns a"], element: Int[Array, " e"] | None = None
+    ) -> Float[Array, "e r a"]:
+        """Weighted gradients of potentials in each element, or in some: their products are integrals over elements."""
+        slopes, dofs = (self.slopes, self.dofs) if element is None else (self.slopes[element], self.dofs[element])
+        return jnp.einsum("ekr,eka->era", slopes, potential[dofs])
 
 
 class _Contacts(NamedTuple):

@@ -25,7 +25,7 @@ from ..contacts.bump_responses import rule_of
 from ..linalg import lapack
 from ..model.bases import Pixels
 from ..model.discretisation import Model
-from ..model.forward_model import coefficients, fields, four_terminal, series_resistance, terminal_matrix, transfer
+from ..model.forward_model import coefficients, fields, four_terminal, series_slopes, terminal_matrix, transfer
 from ..skin.protocol import ProtocolError
 
 Numbers = np.ndarray | Array
@@ -231,10 +231,9 @@ class SiteContacts(eqx.Module):
         """Sensitivity of every reading to the contacts; ``chart``: flat coordinates of the nodes, m, which may move."""
         theta = coefficients(model, None)
         x = fields(model, theta)
-        system = model.system
-        flat = jnp.einsum("ekr,eka->era", system.slopes, x.potential[system.dofs])
-        products = jnp.einsum("era,erb->eab", flat, flat)
-        resistances = jax.jacrev(lambda sigma: series_resistance(system, theta._replace(sigma=sigma)))(theta.sigma)
+        gradients = model.system.gradients(x.potential)
+        products = jnp.einsum("era,erb->eab", gradients, gradients)
+        resistances = series_slopes(model.system, theta)
         corners = chart[model.triangles]
         own = np.arange(model.electrodes)
 
