@@ -59,8 +59,9 @@ def message(name: str, known: Sequence[str]) -> str:
 
 def _room_of(name: str) -> str:
     """Where the name is, by the lists of the rooms: none of them is imported."""
-    for room in sorted(Path(__file__).parent.glob("*/__init__.py")):
-        if re.search(rf'^    "{re.escape(name)}",$', room.read_text(encoding="utf-8"), re.MULTILINE):
+    own = re.escape(name)
+    for room in sorted(Path(__file__).parent.glob("*/__init__.py*")):  # of Python, and stubs of names on first use
+        if re.search(rf'^    "{own}",$|\b{own} as {own}\b', room.read_text(encoding="utf-8"), re.MULTILINE):
             return f"it is jaxeit.{room.parent.name}.{name}"
     return ""
 

@@ -26,3 +26,10 @@ def test_no_module_starts_jax_when_it_is_imported(root):
         [sys.executable, "-c", WALK], cwd=root, capture_output=True, text=True, timeout=120, check=False
     )
     assert done.returncode == 0, done.stderr[-1000:]
+
+
+def test_images_do_without_the_solvers(root):
+    """Optimistix takes a tenth of a second to import, which the first image need not wait for."""
+    names = "je.load_skin, je.discretise, je.forward, je.prepare, je.LevelCentroid, je.pad_masks, je.fuse, je.Imaging"
+    code = f"import sys; import jaxeit as je; {names}; raise SystemExit('optimistix' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=root, timeout=120, check=False).returncode == 0

@@ -11,8 +11,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from .._compile import full_precision, require_known, verb
-from ..imaging.absolute.background import sheet_of
 from ..imaging.noise import InverseError, Whitened, whitened_readings
+from ..imaging.untouched import sheet_of
 from ..model.bases import Elements
 from ..model.discretisation import Model, require_model
 from ..model.sensitivity import pair_jacobian

@@ -18,13 +18,13 @@ from ..kinds import is_number, require_kind
 from ..model.bases import AbstractBasis, BasisMap, Pixels
 from ..model.discretisation import Model, require_model
 from ..model.sensitivity import pair_jacobian
-from .absolute.background import sheet_of
 from .hyperparameters import AbstractHyperparameter, HyperparameterError, spectrum
 from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem
 from .methods.one_step import one_step_image
 from .noise import InverseError, Whitened, Whitening, whitened_readings
 from .priors import AbstractPrior, Noser
 from .reconstruction import IterativeReconstructor, Provenance, Reconstructor
+from .untouched import sheet_of
 
 T = TypeVar("T")
 

@@ -31,22 +31,6 @@ Example:
     print(fit.value, fit.state.square)  # exponent and factor; what is left, N^2
 """
 
-from .adjoint import ImplicitStep
-from .levenberg_marquardt import LeastSquaresState, LevenbergMarquardt
-from .non_negative import DenseProblem, DiagonalProblem, DualNewton, InteriorPoint
-from .searches import BoundedDescent, Cholesky, DampingSearch, normal_equations, quadratic
+import lazy_loader
 
-__all__ = [
-    "BoundedDescent",
-    "Cholesky",
-    "DampingSearch",
-    "DenseProblem",
-    "DiagonalProblem",
-    "DualNewton",
-    "ImplicitStep",
-    "InteriorPoint",
-    "LeastSquaresState",
-    "LevenbergMarquardt",
-    "normal_equations",
-    "quadratic",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -13,8 +13,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from .._compile import require_known
-from ..imaging.absolute.background import UntouchedSheet, fitted_sheet, untouched_frame
+from ..imaging.absolute.background import UntouchedSheet, fitted_sheet
 from ..imaging.noise import InverseError, require_real
+from ..imaging.untouched import untouched_frame
 from ..kinds import require_unmasked
 from ..model.discretisation import Model, require_model
 from ..skin.description import Skin

@@ -7,13 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from ...kinds import stated
 from ...model.bases import BasisMap, Pixels
 from ...model.discretisation import Model
-from ...model.forward_model import CoatedSheet, forward
-from ..noise import InverseError, require_real
+from ...model.forward_model import forward
 from ..priors import AbstractPrecision, GaussianSmooth
 from .frames import checked_frame, frame_error, require_explained, require_positive, require_steps, sheet_level
 from .images import (
@@ -126,7 +124,7 @@ def fitted_sheet(model: Model, v0: Float[Array, " readings"]) -> UntouchedSheet:
     Raises:
         InverseError: as for `fit_background`, of an argument ``untouched``.
     """
-    sigma, precision, image = _untouched_sheet(model, v0)
+    sigma, precision, image = untouched_sheet(model, v0)
     values, vectors = np.linalg.eigh(np.asarray(precision, float))  # ascending: the largest variances first
     share = np.cumsum(1 / values) / np.sum(1 / values)
     count = 1 + int(np.searchsorted(share, ERROR_VARIANCE))
@@ -134,7 +132,7 @@ def fitted_sheet(model: Model, v0: Float[Array, " readings"]) -> UntouchedSheet:
     return UntouchedSheet(sigma, np.asarray(jax.vmap(image.expand)(pixels), float).T)
 
 
-def _untouched_sheet(
+def untouched_sheet(
     model: Model, untouched: Float[Array, "..."]
 ) -> tuple[Float[Array, " elements"], Float[Array, "basis basis"], BasisMap]:
     """Conductivity of an untouched sheet, S, the precision of the logarithm of its pixels, and these pixels."""
@@ -165,42 +163,3 @@ def coat_precision(image: BasisMap, length: Float[ArrayLike, ""]) -> AbstractPre
     smooth = eqx.tree_at(lambda prior: prior.length, GaussianSmooth(), jnp.asarray(length, image.picture.centres.dtype))
     found: AbstractPrecision = smooth.precision(jnp.zeros((1, image.size), smooth.length.dtype), image.picture)
     return found
-
-
-def sheet_of(
-    model: Model,
-    untouched: Float[ArrayLike, " readings"] | None,
-    sigma: Float[Array, " elements"] | None,
-    channels: Bool[ArrayLike, " readings"] | None,
-) -> Float[Array, " elements"] | None:
-    """The conductivity of the untouched sheet, (elements,) S, from what is known of it; None: it is even.
-
-    Raises:
-        InverseError: if both a frame and a conductivity are given, or no coating explains the frame.
-    """
-    if sigma is not None and not hasattr(sigma, "shape") and not isinstance(sigma, CoatedSheet):
-        raise InverseError(f"sigma is {stated(sigma)}; give the conductivity of each element, S, as an array")
-    frame = untouched_frame(model, untouched, sigma, channels)
-    return sigma if frame is None else _untouched_sheet(model, frame)[0]
-
-
-def untouched_frame(
-    model: Model,
-    untouched: Float[ArrayLike, " readings"] | None,
-    sigma: Float[Array, " elements"] | None,
-    channels: Bool[ArrayLike, " readings"] | None,
-) -> Float[Array, "..."] | None:
-    """The frame to which the sheet is fitted, with NaN for readings that are not used; None without a frame.
-
-    Raises:
-        InverseError: if both a frame and a conductivity are given.
-    """
-    if untouched is None:
-        return None
-    if sigma is not None:
-        raise InverseError("untouched and sigma both tell the sheet; give one of them")
-    require_real(untouched=untouched)
-    frame = jnp.asarray(untouched, model.dtype)
-    if channels is not None and frame.shape == np.shape(channels):
-        frame = jnp.where(jnp.asarray(channels, bool), frame, jnp.nan)
-    return frame

@@ -5,13 +5,8 @@ from functools import partial
 import jax
 from jaxtyping import Array, Float
 
+from ... import least_squares  # imported on first use, since optimistix takes a tenth of a second
 from ..._compile import sequential_on_cpu
-from ...least_squares.non_negative import (
-    DenseProblem,
-    DiagonalProblem,
-    positive_by_interior_point,
-    positive_by_newton,
-)
 from ...registry import limited
 from ..priors import Diagonal
 from .base import AbstractIterativeMethod, Problem
@@ -34,9 +29,9 @@ class NonNegative(AbstractIterativeMethod):
         j, precision = problem.jacobian, problem.precision()
         square = problem.strength(precision.solve(j.T))
         if isinstance(precision, Diagonal):
-            diagonal = DiagonalProblem(j, square * precision.values, y)
-            find = sequential_on_cpu(partial(positive_by_newton, steps=self.steps))
+            diagonal = least_squares.DiagonalProblem(j, square * precision.values, y)
+            find = sequential_on_cpu(partial(least_squares.non_negative.positive_by_newton, steps=self.steps))
             return diagonal.solution(find(jax.lax.stop_gradient(diagonal)))
-        dense = DenseProblem(j.T @ j + square * precision.matrix(), j.T @ y)
-        find_dense = sequential_on_cpu(partial(positive_by_interior_point, steps=self.steps))
+        dense = least_squares.DenseProblem(j.T @ j + square * precision.matrix(), j.T @ y)
+        find_dense = sequential_on_cpu(partial(least_squares.non_negative.positive_by_interior_point, steps=self.steps))
         return dense.solution(find_dense(jax.lax.stop_gradient(dense)))
