@@ -19,10 +19,10 @@ from matplotlib.figure import Figure
 import calib
 import jaxeit as je
 from calib.fitting import Geometry, Places, geometry_of
-from calib.fitting.held_out import folds_by_place
+from calib.fitting.cross_validation.held_out import folds_by_place
+from calib.fitting.cross_validation.scores import rmse
 from calib.fitting.pads import LocatedPresses, PadModel, fit_pads
 from calib.fitting.results import FitResult
-from calib.fitting.validation import rmse
 from calib.presses import PressData, pool_presses
 from calib.runtime import set_up
 

@@ -19,7 +19,7 @@ import numpy as np
 import calib
 from calib.bench import Bench, load_bench, simulate
 from calib.calibration.evaluation import FORCE_THIRDS, Evaluation
-from calib.fitting.validation import rmse
+from calib.fitting.cross_validation.scores import rmse
 from jaxeit import effects as fx
 
 from .harness import ROOT, Question, Run

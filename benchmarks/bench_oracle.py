@@ -31,7 +31,7 @@ from calib.calibration.application import FORCE_MAP_FORMAT, TRACKS
 from calib.calibration.evaluation import Evaluation
 from calib.calibration.localisation.contact_tracks import TRACK_ARRAYS
 from calib.calibration.localisation.ellipses import INSIDE_90
-from calib.fitting.validation import rmse
+from calib.fitting.cross_validation.scores import rmse
 from calib.session import Session, open_archive
 from tests.oracles.bench import Bench, Faults
 

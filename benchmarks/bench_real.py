@@ -23,7 +23,7 @@ from scipy.io import loadmat
 
 import calib
 from calib.cli import main as jaxeit
-from calib.fitting.validation import rmse
+from calib.fitting.cross_validation.scores import rmse
 from calib.runtime import set_up
 from calib.session import read_archive
 

@@ -14,12 +14,12 @@ from jaxeit.kinds import require_unmasked
 from jaxeit.notebook import card
 from jaxeit.tracking import ContactLaw, LearnedLayer
 
+from ..fitting.cross_validation.selection import Candidate
 from ..fitting.curves import FittedCurve
 from ..fitting.fields import FittedField, Places
 from ..fitting.intervals import NoiseLaw
 from ..fitting.pad_gains import PadGains
 from ..fitting.pads import PadModel
-from ..fitting.selection import Candidate
 from ..presses.crosstalk import Crosstalk
 from ..presses.table import Processing
 from ..session import SessionError, read_archive, write_archive

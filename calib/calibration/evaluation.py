@@ -14,7 +14,7 @@ import numpy as np
 
 import jaxeit as je
 
-from ..fitting.held_out import Split, interval, place_draws
+from ..fitting.cross_validation.held_out import Split, interval, place_draws
 
 CALIBRATED = "calibrated"
 FORCE_THIRDS = ("small", "middle", "large")

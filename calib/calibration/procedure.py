@@ -11,8 +11,9 @@ import numpy as np
 import jaxeit as je
 
 from ..check.acceptance import accept
+from ..fitting.cross_validation.neighbourhoods import with_error_scale
 from ..fitting.fields import single_places
-from ..fitting.neighbourhoods import with_error_scale
+from ..fitting.fields.unpressed_walls import unpressed_note
 from ..fitting.pads import PadModel
 from ..fitting.response import (
     HeldOutForces,
@@ -22,7 +23,6 @@ from ..fitting.response import (
     hold_out_response,
     require_every_pad_pressed,
 )
-from ..fitting.unpressed_walls import unpressed_note
 from ..presses.contradictions import contradicted_presses, drifting_pads, moved_places
 from ..presses.pooled import PooledPresses, pool_presses
 from ..presses.skins import differing_parts

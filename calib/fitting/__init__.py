@@ -23,6 +23,7 @@ Example:
     print(found.force, found.standard_error, found.valid)  # N, N; the second is beyond what was fitted
 """
 
+from .cross_validation.selection import Candidate
 from .curves import (
     CURVES,
     AbstractCurve,
@@ -60,7 +61,6 @@ from .logs import fit_log
 from .losses import LOSSES, AbstractLoss, Cauchy, Huber, SoftL1, Squared
 from .pads import PadModel
 from .results import FitError, FitResult
-from .selection import Candidate
 
 __all__ = [
     "CURVES",

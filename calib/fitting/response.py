@@ -9,20 +9,20 @@ import numpy as np
 import jaxeit as je
 
 from ..presses.pooled import PressData
+from .cross_validation.held_out import Folds, Split, folds_by_place, hold_out_image, leave_out
+from .cross_validation.neighbourhoods import error_scale, hold_out_scaled
+from .cross_validation.selection import Choice, choose, chosen_without
 from .curves.base import AbstractCurve
 from .curves.elementary import Linear
 from .curves.fitted import FittedCurve
 from .fields.base import AbstractField
 from .fields.geometry import geometry_of
 from .fields.places import Places, single_places
-from .held_out import Folds, Split, folds_by_place, hold_out_image, leave_out
+from .fields.steady_places import steady_places
 from .intervals import NoiseLaw
 from .losses import AbstractLoss
-from .neighbourhoods import error_scale, hold_out_scaled
 from .pads import LocatedPresses, PadModel
 from .results import FitError, FitResult
-from .selection import Choice, choose, chosen_without
-from .steady_places import steady_places
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ import jaxeit as je
 from ..calibration.calibration import Calibration
 from ..calibration.evaluation import FORCE_METHODS, FORCE_THIRDS, Evaluation, localisation_errors
 from ..calibration.given import require_calibration
-from ..fitting.selection import Candidate
+from ..fitting.cross_validation.selection import Candidate
 from ..session import replacing
 from .figures.parts import require_matplotlib
 from .figures.presses import ESTIMATOR_MEANING

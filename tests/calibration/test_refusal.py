@@ -15,7 +15,7 @@ from calib.bench import Bench, Timing, simulate
 from calib.calibration.logs import procedure as logs
 from calib.check import RecordingError
 from calib.cli import main
-from calib.fitting import held_out, selection
+from calib.fitting.cross_validation import held_out, selection
 from calib.fitting.logs import selection as log_selection
 from calib.fitting.response import fold_presses
 from calib.fitting.results import FitError, FitResult

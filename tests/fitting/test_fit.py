@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from scipy import linalg, optimize
 
+from calib.fitting.cross_validation.scores import assign_folds, mae, percent_full_scale, rmse, score
+from calib.fitting.cross_validation.selection import Tried, simplest
 from calib.fitting.curves import Affine, AffinePlay, Linear, MonotoneSpline, PowerLaw, fit_curve, fit_curves
 from calib.fitting.curves.fit import default_solver, fit_samples
 from calib.fitting.curves.fitted import predict_pads
@@ -15,8 +17,6 @@ from calib.fitting.curves.samples import Samples, gather
 from calib.fitting.logs import BestChannel, fit_log, time_split
 from calib.fitting.losses import Cauchy, Huber, SoftL1, Squared
 from calib.fitting.results import FitError, FitResult
-from calib.fitting.selection import Tried, simplest
-from calib.fitting.validation import assign_folds, mae, percent_full_scale, rmse, score
 
 from ..helpers import REAL_DATA, spread_stacks
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from calib.fitting.cross_validation.held_out import Folds, folds_by_place
+from calib.fitting.cross_validation.neighbourhoods import error_scale, with_error_scale
 from calib.fitting.curves import Linear
 from calib.fitting.curves.fitted import Prediction
 from calib.fitting.fields import PadEdge, geometry_of, single_places
 from calib.fitting.fields.fitted import LogGain
-from calib.fitting.held_out import Folds, folds_by_place
 from calib.fitting.intervals import NORMAL_MULTIPLE, NoiseLaw, fit_noise
 from calib.fitting.losses import SoftL1
-from calib.fitting.neighbourhoods import error_scale, with_error_scale
 from calib.fitting.pad_gains import PadGains
 from calib.fitting.pad_predictions import with_gain
 from calib.fitting.pads import LocatedPresses, PadModel, fit_pads, forces, pad_forces

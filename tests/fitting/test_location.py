@@ -14,6 +14,8 @@ from scipy.special import gamma, kv
 
 import jaxeit as je
 from calib import cli
+from calib.fitting.cross_validation.held_out import Folds, folds_by_place
+from calib.fitting.cross_validation.selection import choose
 from calib.fitting.curves import CURVES, Linear
 from calib.fitting.fields import (
     FIELDS,
@@ -32,12 +34,10 @@ from calib.fitting.fields import (
 from calib.fitting.fields.base import restored
 from calib.fitting.fields.evidence import PRIOR_RATIOS
 from calib.fitting.fields.fitted import pad_features
-from calib.fitting.held_out import Folds, folds_by_place
+from calib.fitting.fields.unpressed_walls import unpressed_note
 from calib.fitting.losses import SoftL1
 from calib.fitting.pads import LocatedPresses, fit_pads
 from calib.fitting.results import FitResult
-from calib.fitting.selection import choose
-from calib.fitting.unpressed_walls import unpressed_note
 from calib.presses.pooled import PressData, PressSeries, thinned
 
 from ..helpers import require_identical, spread_stacks

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from calib.calibration.evaluation import _cv, _mean, _rms
+from calib.fitting.cross_validation.held_out import interval, leave_out, place_draws
 from calib.fitting.curves import Linear
 from calib.fitting.fields import PadEdge, geometry_of, single_places
-from calib.fitting.held_out import interval, leave_out, place_draws
 from calib.fitting.losses import SoftL1
 from calib.fitting.pads import LocatedPresses
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import jaxeit as je
+from calib.fitting.cross_validation.neighbourhoods import with_error_scale
 from calib.fitting.curves import Linear
 from calib.fitting.fields import PadEdge, PadEdgeSpline, Places, geometry_of, single_places
+from calib.fitting.fields.steady_places import MIN_PRESSES, steady_places
 from calib.fitting.losses import SoftL1
-from calib.fitting.neighbourhoods import with_error_scale
 from calib.fitting.response import fit_response, fold_presses, hold_out_response
-from calib.fitting.steady_places import MIN_PRESSES, steady_places
 
 from ..helpers import require_identical
 from .test_intervals import pressed

@@ -16,10 +16,10 @@ from calib.calibration.calibration import Calibration
 from calib.calibration.evaluation import Evaluation
 from calib.calibration.hysteresis_loops import Loops
 from calib.calibration.press_examples import PressExamples
+from calib.fitting.cross_validation.held_out import Split
+from calib.fitting.cross_validation.selection import Candidate
 from calib.fitting.curves import FittedCurve, Linear
 from calib.fitting.fields import FittedField, PadEdge, geometry_of, log_gain, single_places
-from calib.fitting.held_out import Split
-from calib.fitting.selection import Candidate
 from calib.report import pictures
 from calib.report.document import write_report
 from calib.report.figures import parts

@@ -13,11 +13,11 @@ import numpy as np
 import jaxeit as je
 from jaxeit.toml import TomlTable, parse_toml
 
+from ...fitting.cross_validation.selection import Candidate, Choice
 from ...fitting.curves import CURVES, AbstractCurve, FittedCurve, Linear
 from ...fitting.fields import FIELDS, AbstractField, FittedField, Geometry
 from ...fitting.fields.base import restored
 from ...fitting.intervals import NoiseLaw
-from ...fitting.selection import Candidate, Choice
 from ...presses.crosstalk import Crosstalk
 from ...presses.table import Processing
 from ...session import Archive

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
+from ...fitting.cross_validation.selection import Candidate
 from ...fitting.curves import CURVES
 from ...fitting.logs import LogModel, LogPrediction, LogTracker, travel_of, unseen_direction
-from ...fitting.selection import Candidate
 from ...session import SessionError, read_archive, write_archive
 from .evaluation import LogEvaluation
 from .readings import reading, readings, require_later

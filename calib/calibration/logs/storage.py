@@ -10,10 +10,10 @@ import numpy as np
 
 import jaxeit as je
 
+from ...fitting.cross_validation.selection import Candidate
 from ...fitting.curves import CURVES, FittedCurve
 from ...fitting.fields import FIELDS
 from ...fitting.logs import COMBINATIONS, AbstractCombination, LogLocation, LogModel, LogNoise, Travel
-from ...fitting.selection import Candidate
 from ...session import Archive
 from ..archives.storage import SEAL, field_arrays, field_from, seal
 from .evaluation import LogEvaluation

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Real
 
 from jaxeit.registry import AbstractChoice
 
-from ..order_statistics import median, quantiles
+from .order_statistics import median, quantiles
 
 Scalar = Float[Array, ""]
 Params = Float[Array, " parameters"]

@@ -7,7 +7,6 @@ from jax.typing import DTypeLike
 
 from jaxeit.registry import limited
 
-from ..order_statistics import median
 from .base import (
     AbstractCurve,
     Mask,
@@ -21,6 +20,7 @@ from .base import (
     resistant_line,
     start_slope,
 )
+from .order_statistics import median
 
 # A load no larger than this counts as zero (pressure as a multiple of P0, force in N). The derivative z**(b - 1) of a
 # power is infinite at zero for b < 1; at 1e-30 it is still finite in float32.

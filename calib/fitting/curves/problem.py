@@ -7,8 +7,8 @@ from jaxtyping import Array, Bool, Float
 
 from ...presses.streams import MAD_TO_SIGMA
 from ..losses import AbstractLoss
-from ..order_statistics import median
 from .base import AbstractCurve, Scale
+from .order_statistics import median
 from .samples import Samples
 
 # Parts into which samples without groups are cut in order of time; residuals of different parts count as independent.

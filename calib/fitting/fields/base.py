@@ -35,7 +35,7 @@ class AbstractField(AbstractChoice):
     ``early`` holds settings that files of early versions lack, with the values that these versions had; ``former``
     those that this version lacks, with the values at which its fields are the same.
     ``steady``: the field is fitted to the places where images show presses on average, by the stage
-    (`calib.fitting.steady_places`), where they are known; otherwise to the place of each image.
+    (`calib.fitting.fields.steady_places`), where they are known; otherwise to the place of each image.
     """
 
     early: ClassVar[Mapping[str, Any]] = {}

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from ..cross_validation.scores import Score, score, trusted_forces
 from ..curves.base import AbstractCurve
 from ..curves.fit import fit_curves
 from ..curves.fitted import FittedCurve
 from ..curves.samples import Numbers
 from ..results import FitError
-from ..validation import Score, score, trusted_forces
 from .blend import BlendChannels
 from .combination import AbstractCombination, one_channel
 

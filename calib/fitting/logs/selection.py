@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from ..cross_validation.selection import Candidate, Tried, simplest
 from ..curves import CURVES
 from ..curves.base import AbstractCurve
 from ..curves.elementary import Affine
@@ -24,7 +25,6 @@ from ..curves.fitted import FittedCurve
 from ..fields import FIELDS, AbstractField, FittedField
 from ..losses import AbstractLoss
 from ..results import FitError, FitResult
-from ..selection import Candidate, Tried, simplest
 from .blend import BestChannel, BlendChannels, WithPlace
 from .combination import AbstractCombination, one_channel
 from .directions import cycles_of, travel_of

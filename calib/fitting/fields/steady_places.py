@@ -15,11 +15,11 @@ from jaxtyping import Array, Bool, Float
 
 import jaxeit as je
 
-from ..presses.streams import robust_deviation
-from .curves.samples import by_rows
-from .fields import Geometry, Places
-from .fields.base import cubic_bspline
-from .fields.geometry import distance, nearest_points
+from ...presses.streams import robust_deviation
+from ..curves.samples import by_rows
+from . import Geometry, Places
+from .base import cubic_bspline
+from .geometry import distance, nearest_points
 
 # Images err towards the middle near the rim of the sheet, alike at all sides: by B-splines over octaves of distance.
 RIM_WIDTH, BUMPS = 8e-3, 3

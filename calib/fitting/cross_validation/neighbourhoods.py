@@ -13,15 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
-from .curves.base import AbstractCurve
-from .curves.samples import by_rows
-from .fields.base import AbstractField
-from .fields.fitted import FittedField, centred_features
-from .fields.places import Places
+from ..curves.base import AbstractCurve
+from ..curves.samples import by_rows
+from ..fields.base import AbstractField
+from ..fields.fitted import FittedField, centred_features
+from ..fields.places import Places
+from ..intervals import NORMAL_MULTIPLE, NoiseLaw, most_likely_sizes
+from ..pads import PadModel
 from .held_out import Folds, HeldOut, joined
-from .intervals import NORMAL_MULTIPLE, NoiseLaw, most_likely_sizes
-from .pads import PadModel
-from .validation import assign_folds
+from .scores import assign_folds
 
 # Correlation between the fields at two places, by the prior, above which the places are of one neighbourhood: each then
 # explains half of the variance of the other.

@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 
 import jaxeit as je
 
-from .curves.samples import by_rows
-from .fields import FittedField, Geometry, PadEdge, PadEdgeSpline, Places
-from .fields.geometry import onto_pads
-from .fields.pad_edge import wall_distances
+from ..curves.samples import by_rows
+from . import FittedField, Geometry, PadEdge, PadEdgeSpline, Places
+from .geometry import onto_pads
+from .pad_edge import wall_distances
 
 # Octaves between two distances that are worth a word: the grid above has 0.68 to 0.71, one of 15 x 15, whose intervals
 # hold, 0.60, and scattered presses have 0.1 to 0.2. And the octave from which on walls hardly matter.

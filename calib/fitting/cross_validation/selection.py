@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .curves import CURVES, AbstractCurve
-from .fields import FIELDS, AbstractField
+from ..curves import CURVES, AbstractCurve
+from ..fields import FIELDS, AbstractField
+from ..pads import PadModel
 from .held_out import Folds
-from .pads import PadModel
 
 MAX_SAID = 12  # candidates that the reason in words names; the table of the report has all
 NOTHING_HELD: frozenset[int] = frozenset()

@@ -14,17 +14,17 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ..presses.means import DOMINANT_SHARE
-from ..presses.pooled import MIN_SHARE, PressData
-from .curves.base import AbstractCurve
-from .curves.fit import fit_curves
-from .fields.base import AbstractField
-from .fields.fitted import FittedField
-from .intervals import COVERAGE, NoiseLaw, fit_noise
-from .losses import AbstractLoss
-from .pads import LocatedPresses, PadForces, PadModel, along_presses, fit_pads, over_holds
-from .results import FitResult
-from .validation import assign_folds
+from ...presses.means import DOMINANT_SHARE
+from ...presses.pooled import MIN_SHARE, PressData
+from ..curves.base import AbstractCurve
+from ..curves.fit import fit_curves
+from ..fields.base import AbstractField
+from ..fields.fitted import FittedField
+from ..intervals import COVERAGE, NoiseLaw, fit_noise
+from ..losses import AbstractLoss
+from ..pads import LocatedPresses, PadForces, PadModel, along_presses, fit_pads, over_holds
+from ..results import FitResult
+from .scores import assign_folds
 
 DRAWS = 2000  # draws of the bootstrap; the ends of an interval then vary by about 2 % of its length
 

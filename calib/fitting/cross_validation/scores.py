@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
-from .curves.fitted import FittedCurve, predict_pads
-from .curves.samples import Numbers
-from .results import FitError, FitResult
+from ..curves.fitted import FittedCurve, predict_pads
+from ..curves.samples import Numbers
+from ..results import FitError, FitResult
 
 # --- metrics, over the samples where both are finite -----------------------------------------------------------------
 

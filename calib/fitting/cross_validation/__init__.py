@@ -1,0 +1,1 @@
+"""Errors on presses that a fit has not seen, and the choice among candidates by them."""
