@@ -24,7 +24,7 @@ from ..meshing.generation import expected_nodes, triangulate
 from ..meshing.triangles import CROWDED, MIN_ANGLE, Mesh
 from ..notebook import MAX_LINES, Drawing, card
 from ..skin.description import Skin
-from ..skin.electrodes import touched
+from ..skin.electrodes.base import touched
 from .fidelity import Fidelity, FidelityError, require_dtype
 from .metal_sheet import Coat, lay_coat
 from .mixing import Mixing, padded_rows

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, Integer
 
 from ..linalg import AbstractPlan, SparsityPattern
 from ..meshing.elements import Space
-from ..skin.electrodes import Touched
+from ..skin.electrodes.base import Touched
 from .unknowns import Unknowns
 
 

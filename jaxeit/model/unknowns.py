@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..meshing.elements import Space
-from ..skin.electrodes import ElectrodeError, Touched
+from ..skin.electrodes.base import ElectrodeError, Touched
 
 RIM_PENALTY = 10.0
 """Sets the fall of the ground weight with the distance from the middle of the sheet: the resistance to the rest of the

@@ -16,7 +16,6 @@ Example:
     print(f"{scan.readings} readings in {1e3 * scan.frame_time:.2f} ms; {len(skin.pads)} pads")
 """
 
-from .bolts import AreaPatch
 from .description import (
     Pad,
     PressureSensor,
@@ -27,16 +26,17 @@ from .description import (
     parse_skin,
     shipped_skins,
 )
-from .edges import BoundaryPatch
-from .electrodes import ELECTRODES, AbstractAreaElectrode, AbstractElectrode, ElectrodeError, Pieces
+from .electrodes.base import ELECTRODES, AbstractAreaElectrode, AbstractElectrode, ElectrodeError, Pieces
+from .electrodes.bolts import AreaPatch
+from .electrodes.edges import BoundaryPatch
+from .electrodes.points import PointElectrode
+from .electrodes.polygons import PolygonPatch, RectanglePatch
+from .electrodes.rims import rim_electrodes
+from .electrodes.rings import RingPatch
 from .identity import skin_hash
 from .patterns import adjacent, all_pairs, eidors_adjacent, named_pattern, named_protocol, opposite, skip, trigonometric
-from .points import PointElectrode
-from .polygons import PolygonPatch, RectanglePatch
 from .protocol import Protocol, ProtocolError, reciprocal_rows
 from .rewriting import with_positions, with_rows
-from .rims import rim_electrodes
-from .rings import RingPatch
 
 __all__ = [
     "ELECTRODES",

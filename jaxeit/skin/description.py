@@ -19,7 +19,7 @@ from ..kinds import require_kind, stated
 from ..notebook import Drawing, card
 from ..registry import RegistryError
 from ..toml import TomlError, TomlTable, parse_toml, read_text
-from .electrodes import ELECTRODES, AbstractElectrode
+from .electrodes.base import ELECTRODES, AbstractElectrode
 from .patterns import NAMES, named_protocol
 from .protocol import Protocol, ProtocolError
 

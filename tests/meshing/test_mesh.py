@@ -15,7 +15,7 @@ from jaxeit.meshing.generation import Mesh, MeshError, TrianglePattern, structur
 from jaxeit.meshing.outlines import ArcFootprint, DiscFootprint, PointFootprint, polygon_radius
 from jaxeit.meshing.smoothing import Triangulation
 from jaxeit.meshing.triangles import CROWDED
-from jaxeit.skin.electrodes import require_contact
+from jaxeit.skin.electrodes.base import require_contact
 
 L_SHAPE = Polygon(((0, 0), (0.2, 0), (0.2, 0.1), (0.1, 0.1), (0.1, 0.2), (0, 0.2)))
 SQUARE = Rectangle(0.2, 0.2)

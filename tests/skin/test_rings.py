@@ -11,7 +11,7 @@ from jaxeit.linalg import Dense
 from jaxeit.meshing.elements import function_space
 from jaxeit.meshing.generation import triangulate
 from jaxeit.meshing.outlines import DiscFootprint, PointFootprint, PolygonFootprint, polygon_radius
-from jaxeit.skin.rings import RingFootprint
+from jaxeit.skin.electrodes.rings import RingFootprint
 
 from ..helpers import skin_of
 from .test_skin import _with_electrodes

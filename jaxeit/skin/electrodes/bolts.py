@@ -5,11 +5,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..geometry.shapes import Domain
-from ..meshing.elements import Space
-from ..meshing.outlines import DiscFootprint
-from ..toml import TomlTable
-from .electrodes import AbstractAreaElectrode, require_contact, require_covered, require_positive
+from ...geometry.shapes import Domain
+from ...meshing.elements import Space
+from ...meshing.outlines import DiscFootprint
+from ...toml import TomlTable
+from .base import AbstractAreaElectrode, require_contact, require_covered, require_positive
 from .places import read_area_contact, read_positions_inside, read_radius
 
 LEAST_TRANSFER = 0.1

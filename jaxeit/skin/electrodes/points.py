@@ -5,11 +5,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..geometry.shapes import Domain
-from ..meshing.elements import Space
-from ..meshing.outlines import PointFootprint
-from ..toml import TomlTable
-from .electrodes import AbstractElectrode, ElectrodeError, Pieces
+from ...geometry.shapes import Domain
+from ...meshing.elements import Space
+from ...meshing.outlines import PointFootprint
+from ...toml import TomlTable
+from .base import AbstractElectrode, ElectrodeError, Pieces
 from .places import read_positions_inside
 
 

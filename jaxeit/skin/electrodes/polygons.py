@@ -6,12 +6,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..geometry.shapes import Domain, Polygon, cross
-from ..meshing.elements import Space
-from ..meshing.outlines import PolygonFootprint
-from ..meshing.smoothing import doubled_areas
-from ..toml import TomlTable
-from .electrodes import AbstractAreaElectrode, ElectrodeError, require_contact
+from ...geometry.shapes import Domain, Polygon, cross
+from ...meshing.elements import Space
+from ...meshing.outlines import PolygonFootprint
+from ...meshing.smoothing import doubled_areas
+from ...toml import TomlTable
+from .base import AbstractAreaElectrode, ElectrodeError, require_contact
 from .places import read_area_contact, read_positions
 
 

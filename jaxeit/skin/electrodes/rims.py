@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..budget import require
-from ..geometry.shapes import Domain
+from ...budget import require
+from ...geometry.shapes import Domain
+from .base import ElectrodeError, require_contact
 from .edges import BoundaryPatch
-from .electrodes import ElectrodeError, require_contact
 from .points import PointElectrode
 
 RAY = 4096  # points on a ray from the middle of the sheet to beyond its rim, before the crossing is bisected

@@ -5,12 +5,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..budget import require
-from ..geometry.shapes import Domain
-from ..meshing.elements import Space
-from ..meshing.outlines import ArcFootprint
-from ..toml import TomlError, TomlTable
-from .electrodes import AbstractElectrode, ElectrodeError, Pieces, require_contact, require_positive
+from ...budget import require
+from ...geometry.shapes import Domain
+from ...meshing.elements import Space
+from ...meshing.outlines import ArcFootprint
+from ...toml import TomlError, TomlTable
+from .base import AbstractElectrode, ElectrodeError, Pieces, require_contact, require_positive
 from .places import read_contact
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ..budget import require
-from ..geometry.shapes import Domain
-from ..toml import TomlError, TomlTable
+from ...budget import require
+from ...geometry.shapes import Domain
+from ...toml import TomlError, TomlTable
 
 # ohm m^2, or ohm m on the rim: a bolt of 3 mm radius then has 350 megohm, as one that is not connected.
 MAX_CONTACT = 1e4

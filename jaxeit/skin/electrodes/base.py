@@ -18,12 +18,12 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from ..geometry.shapes import Domain
-from ..kinds import is_number, shown
-from ..meshing.elements import Space
-from ..meshing.footprints import AbstractFootprint
-from ..registry import Registry
-from ..toml import TomlTable
+from ...geometry.shapes import Domain
+from ...kinds import is_number, shown
+from ...meshing.elements import Space
+from ...meshing.footprints import AbstractFootprint
+from ...registry import Registry
+from ...toml import TomlTable
 
 
 class ElectrodeError(ValueError):

@@ -6,13 +6,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..geometry.shapes import Domain
-from ..meshing.elements import Space
-from ..meshing.footprints import AbstractFootprint, Feature, cycle
-from ..meshing.outlines import MAX_OUTLINE_EDGES, DiscFootprint, enough_segments
-from ..meshing.triangles import MeshError, place
-from ..toml import TomlTable
-from .electrodes import (
+from ...geometry.shapes import Domain
+from ...meshing.elements import Space
+from ...meshing.footprints import AbstractFootprint, Feature, cycle
+from ...meshing.outlines import MAX_OUTLINE_EDGES, DiscFootprint, enough_segments
+from ...meshing.triangles import MeshError, place
+from ...toml import TomlTable
+from .base import (
     AbstractAreaElectrode,
     ElectrodeError,
     require_contact,
