@@ -21,12 +21,13 @@ from jaxeit import effects as fx
 from .bench import Bench, BenchError
 from .dataset import grid
 from .random_scenes import STRENGTHS, DrawnContacts, RandomScenes, Tips, arrange_tips, draw_contacts
+from .resolution import force_shares
 from .streams import history
 
 SHARD_FRAMES = 1024  # frames of one skin
 CHUNK_FRAMES = 128  # frames that are solved together, and of the untouched skin at the start
 HOLD_STEPS = 16  # samples of a hold; the load rises and falls in as many before it
-MAX_TIP_ERROR = 0.1  # of the force of a flat tip on the mesh
+MAX_TIP_ERROR = 0.1  # of the force of a tip on the mesh
 LEAST_FORCE = 1e-7  # N: what is less on a pixel is zero, so that maps take less space
 UNPRESSED = (
     "the scene has no effect by which pressure changes the sheet, so that all frames would be equal; list one, such as "
@@ -79,7 +80,7 @@ class SceneFrames:
     """Simulates shards of frames of random contacts on skins of one scene; made once per process.
 
     Raises:
-        BenchError: if pressure changes no conductivity in the scene; if a flat tip is too small for the mesh.
+        BenchError: if pressure changes no conductivity in the scene; if a tip is too small for the mesh.
         jaxeit.model.MotionError: if electrodes are to be misplaced that cannot move.
     """
 
@@ -303,16 +304,13 @@ def _check_response(voltages: Float[np.ndarray, "n readings"], maps: Float[np.nd
 
 
 def _check_tips(bench: Bench, model: je.Model) -> None:
-    """A flat tip presses on the elements whose centroids are under it, which must be enough of them."""
-    if fx.chosen(model.effects, fx.AbstractLoadEffect):
-        return
+    """A tip presses on the elements whose centroids are under it, which must be enough of them."""
     domain = bench.scene.skin.domain
     places = grid(bench.scene.skin, 9, 9)
     inner = places[domain.boundary_distance(places) > bench.tip_diameter]
-    for place in inner:
-        force = float(jnp.sum(je.model.load_spread(model, place, bench.tip_diameter) * model.areas))
-        if abs(force - 1) > MAX_TIP_ERROR:
+    for place, share in zip(inner, force_shares(model, domain, inner, bench.tip_diameter), strict=True):
+        if abs(share - 1) > MAX_TIP_ERROR:
             raise BenchError(
-                f"a flat tip of {bench.tip_diameter:g} m bears {force:.0%} of its force at {place} m on this mesh; "
-                "take a finer fidelity or a larger tip, or list LoadSpreading"
+                f"a tip of {bench.tip_diameter:g} m bears {share:.0%} of its force at {place} m on this mesh; take a "
+                "finer fidelity or a larger tip, or spread the load wider, as LoadSpreading does"
             )

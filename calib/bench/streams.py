@@ -23,6 +23,7 @@ from .bench import Bench
 from .interpolation import frame_solver
 from .motion import Motion, barometer_rise, loads_at, phase_count, planned_motion, temperature_rise
 from .press_frames import PressFrames
+from .resolution import require_resolved
 
 BLOCK_ROWS = 1024  # samples of a block
 SLIDE_PLACES = 65  # places along a slide at which the response of the pads is computed
@@ -351,6 +352,7 @@ class SimulatedStreams:
 def simulated_streams(bench: Bench, fidelity: je.Fidelity) -> SimulatedStreams:
     """Discretise the scene, apply the effects of the stage to its motion, and set up the streams."""
     model = je.discretise(bench.scene, fidelity)
+    require_resolved(bench, model)
     laid = fx.laid(model.effects, model.centroids)
     model = eqx.tree_at(lambda m: m.effects, model, laid, is_leaf=lambda x: x is model.effects)
     key = jax.random.key(bench.seed)

@@ -179,20 +179,26 @@ def _conductivity(
 
 @verb
 def load_spread(
-    model: Model, centre: Float[ArrayLike, "2"], diameter: Float[ArrayLike, ""]
-) -> Float[Array, " elements"]:
-    """Pressure on the sheet per unit load of a flat round tip, (elements,) 1/m^2.
+    model: Model,
+    centre: Float[ArrayLike, "2"],
+    diameter: Float[ArrayLike, ""],
+    points: Float[Array, "points 2"] | None = None,
+) -> Float[Array, " elements"] | Float[Array, " points"]:
+    """Pressure on the sheet per unit load of a flat round tip, 1/m^2, at the middle of each element.
 
-    The ideal tip presses evenly on its own area; effects of the scene may spread the load.
+    The ideal tip presses evenly on its own area; effects of the scene may spread the load. A load that is narrower
+    than the elements is not resolved: the sum over the elements of pressure times area is then not one.
 
     Args:
         centre: of the tip, (2,) m in the sheet's flat coordinates.
         diameter: of the tip, m.
+        points: where else to tell the pressure, (points, 2) m.
     """
+    points = model.centroids if points is None else points
     touch = Indenter(jnp.asarray(centre, model.dtype), jnp.asarray(diameter, model.dtype))
-    offset = jnp.linalg.norm(model.centroids - touch.centre, axis=-1)
+    offset = jnp.linalg.norm(points - touch.centre, axis=-1)
     even = jnp.where(offset < touch.diameter / 2, 4 / (jnp.pi * touch.diameter**2), 0.0)
-    spread: Array = fold(model.effects, AbstractLoadEffect, even, touch, model.centroids)
+    spread: Array = fold(model.effects, AbstractLoadEffect, even, touch, points)
     return spread
 
 

@@ -31,6 +31,7 @@ from calib.bench import (
 )
 from calib.bench.interpolation import ParameterBox, enclosing_boxes, interpolant
 from calib.bench.motion import loads_at, planned_motion
+from calib.bench.resolution import force_shares
 from calib.bench.streams import simulated_streams
 
 DRAFT = je.Fidelity.draft()
@@ -525,3 +526,23 @@ def test_a_data_set_is_shared_out_over_devices(tmp_path):
         assert done.stdout.strip() == str(count), done.stderr
         found.append(np.load(path))
     np.testing.assert_array_equal(*found)
+
+
+def test_a_load_between_the_elements_is_refused(tmp_path):
+    """The force of the stage would be whole, and the skin would feel none of it."""
+    scene = je.Scene(je.load_skin("testbed"), effects=(je.effects.LoadSpreading(width=2e-4),))
+    bench = Bench(scene, np.array([[0.05, 0.05], [0.15, 0.06]]), np.array([5.0]))
+    with pytest.raises(BenchError, match=r"% of the force of a tip of 0.02 m arrives on the mesh.* finer fidelity"):
+        simulate(bench, tmp_path / "s.h5", fidelity=je.Fidelity.draft())
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("diameter", [0.02, 0.05])
+def test_the_force_that_arrives_is_that_of_the_integral(skin, model, diameter):
+    """The ideal tip has a closed form: a circle within the sheet, half of one on its edge."""
+    places = np.array([[0.06, 0.13], [0.1, 0.1]])
+    tip = np.array([float(model.areas @ je.model.load_spread(model, place, diameter)) for place in places])
+    np.testing.assert_allclose(force_shares(model, skin.domain, places, diameter), tip, rtol=0.02)
+    edge = np.array([[0.1, 0.0]])
+    half = float(model.areas @ je.model.load_spread(model, edge[0], diameter)) / 0.5
+    np.testing.assert_allclose(force_shares(model, skin.domain, edge, diameter), half, rtol=0.05)
