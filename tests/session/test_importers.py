@@ -157,6 +157,26 @@ def test_cells_that_are_no_numbers_are_counted(tmp_path: Path) -> None:
     assert "5 cells are not numbers (first: line 2)" in report.summary()
 
 
+@pytest.mark.parametrize("bits", [16, 24, 32])
+def test_a_counter_that_begins_anew_goes_on(bits: int, tmp_path: Path) -> None:
+    """As `micros()` of an Arduino does after 71.6 minutes."""
+    counts = (2**bits - 5000 + 1000 * np.arange(12)) % 2**bits
+    path = table(tmp_path, "t,f\n" + "".join(f"{count},{number}\n" for number, count in enumerate(counts)))
+    report = load(path, "--time", "0:us", "--stream", "f=1:N", folder=tmp_path)
+    assert (report.files[0].wraps, report.files[0].rows_sorted) == (1, 0)
+    assert "the counter of the clock began anew 1 times" in report.summary()
+    with open_session(tmp_path / "s.h5") as session:
+        np.testing.assert_array_equal(np.diff(session.streams["f"].time), 1_000_000)
+    np.testing.assert_array_equal(stream(tmp_path, "f")[:, 0], np.arange(12))
+
+
+@pytest.mark.parametrize("counts", [[100, 200, 300, 0, 100], [65400, 65500, 30000, 30100], [1.5, 65535.5, 0.5]])
+def test_a_clock_that_was_set_back_is_no_counter_at_its_end(counts: list[float], tmp_path: Path) -> None:
+    path = table(tmp_path, "t,f\n" + "".join(f"{count},1\n" for count in counts))
+    with pytest.raises(SessionError, match="goes back at 1 rows"):
+        load(path, "--time", "0:us", "--stream", "f=1:N", folder=tmp_path)
+
+
 def test_repeated_times_are_dropped_and_backward_ones_need_sort(tmp_path: Path) -> None:
     path = table(tmp_path, "t,f\n0,1\n1,2\n1,3\n3,4\n2,5\n")
     words = [path, "--time", "0:s", "--stream", "f=1:N"]

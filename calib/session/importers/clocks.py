@@ -16,13 +16,18 @@ UNIX_TIME_FROM = 1e8
 """Readings in s above this value (1973) are taken as times since 1970, smaller ones as times since an unknown start."""
 LAST_TIME = 253_402_300_800.0
 """End of the year 9999 in s since 1970: later times have no date, and are those of another unit."""
+COUNTER_BITS = (16, 24, 32)
+"""Sizes of the counters of devices: `micros()` of an Arduino, of 32 bits, begins anew every 71.6 minutes."""
+MAX_WRAP_STEP = 10.0
+"""Largest step over the end of a counter, in median steps: a longer one may be a pause, or a clock that was set."""
 
 
 @dataclass(frozen=True)
 class Clock:
     """Rows that are kept, in order, their times in s, and what was left out.
 
-    ``remedy`` says what to check if the times cannot be kept.
+    ``wraps`` counts how often the counter of the clock began anew. ``remedy`` says what to check if the times cannot be
+    kept.
     """
 
     rows: np.ndarray
@@ -30,6 +35,7 @@ class Clock:
     without: np.ndarray
     equal: np.ndarray
     sorted: int
+    wraps: int = 0
     remedy: str = "check the unit of --time"
 
     @property
@@ -39,10 +45,17 @@ class Clock:
 
 
 def clock_of(path: Path, table: Table, column: str, unit: Unit, sort: bool, counted: str = "line") -> Clock:
-    """Make a clock of strictly increasing times; repeated times are left out, backward times refused or sorted."""
-    seconds = table.values[:, 0] * unit.factor
-    rows = np.flatnonzero(np.isfinite(seconds))
-    without = np.flatnonzero(~np.isfinite(seconds))
+    """Make a clock of strictly increasing times.
+
+    Repeated times are left out. A counter that began anew at its end goes on; other backward times are refused or
+    sorted.
+    """
+    counts = table.values[:, 0]
+    rows, without = np.flatnonzero(np.isfinite(counts)), np.flatnonzero(~np.isfinite(counts))
+    wraps = _wraps(counts[rows])
+    seconds = counts * unit.factor
+    if wraps is not None:
+        seconds[rows] += wraps * unit.factor
     back = np.flatnonzero(np.diff(seconds[rows]) < 0) + 1
     if len(back) and not sort:
         line = table.line[rows[back[0]]]
@@ -55,7 +68,20 @@ def clock_of(path: Path, table: Table, column: str, unit: Unit, sort: bool, coun
     if len(kept) < 2 or len(without) > len(seconds) // 2:
         what = f"only {len(kept):,} of {len(seconds):,} rows have a time of their own"
         raise problem(path, f"column {column}", what, "check the clock's column, and the file")
-    return _dated(path, Clock(kept, seconds[kept], without, np.sort(rows[repeat]), len(back)))
+    times = 0 if wraps is None else len(np.unique(wraps)) - 1
+    return _dated(path, Clock(kept, seconds[kept], without, np.sort(rows[repeat]), len(back), times))
+
+
+def _wraps(counts: np.ndarray) -> np.ndarray | None:
+    """What to add to the counts of a counter that began anew at its end; None for a clock that did not."""
+    steps = np.diff(counts)
+    back = steps < 0
+    if not back.any() or back.all() or counts.min() < 0 or (counts % 1).any():
+        return None
+    size = next((2.0**bits for bits in COUNTER_BITS if counts.max() < 2.0**bits), None)
+    if size is None or (steps[back] + size).max() > MAX_WRAP_STEP * np.median(steps[~back]):
+        return None
+    return size * np.concatenate([[0], np.cumsum(back)])
 
 
 def clock_of_rate(path: Path, rows: int, rate_hz: float, start: float) -> Clock:
@@ -65,7 +91,7 @@ def clock_of_rate(path: Path, rows: int, rate_hz: float, start: float) -> Clock:
     none = np.empty(0, np.int64)
     with np.errstate(over="ignore"):
         seconds = start + np.arange(rows) / rate_hz
-    return _dated(path, Clock(np.arange(rows), seconds, none, none, 0, "check --rate, --start"))
+    return _dated(path, Clock(np.arange(rows), seconds, none, none, 0, remedy="check --rate, --start"))
 
 
 def _dated(path: Path, clock: Clock) -> Clock:

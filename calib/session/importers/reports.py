@@ -49,6 +49,7 @@ class FileReport:
     | equal_times                         | number of rows left out because they have the time of another |
     | first_without_time, first_equal_time | where the first of these is; None: there is none            |
     | rows_sorted                         | number of rows that went back in time and were sorted        |
+    | wraps                               | how often the counter of the clock began anew at its end     |
     | streams                             | a report of each                                             |
     """
 
@@ -60,6 +61,7 @@ class FileReport:
     first_equal_time: int | None
     rows_sorted: int
     streams: tuple[StreamReport, ...]
+    wraps: int = 0
     counted: str = "line"
 
 
@@ -118,6 +120,8 @@ def _file_lines(report: FileReport) -> Iterator[str]:
         yield f"  {report.equal_times:,} rows with a repeated time left out (first: {first})"
     if report.rows_sorted:
         yield f"  {report.rows_sorted:,} rows went back in time and were sorted"
+    if report.wraps:
+        yield f"  the counter of the clock began anew {report.wraps:,} times, and its times go on"
     for s in report.streams:
         shape = f"{s.rows:,} x {s.channels}"
         yield f"  {s.name}: {s.variable} in {s.unit}, {shape}, about {s.rate_hz:.4g} Hz"

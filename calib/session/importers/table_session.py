@@ -348,6 +348,7 @@ def _file_report(part: _Part, streams: Sequence[StreamReport]) -> FileReport:
         equal_times=len(clock.equal),
         first_equal_time=int(line[clock.equal[0]]) if len(clock.equal) else None,
         rows_sorted=clock.sorted,
+        wraps=clock.wraps,
         streams=tuple(streams),
         counted=part.counted,
     )
