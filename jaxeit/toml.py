@@ -173,11 +173,11 @@ class TomlTable:
             raise self.error(key, f"is {SHORT_REPR.repr(value)}; give {meaning}")
         return value
 
-    def number(self, key: str, meaning: str, default: Any = ..., least: float = 0.0) -> float:
-        """A finite number, ``least`` or more; arguments and errors as for `get`."""
+    def number(self, key: str, meaning: str, default: Any = ..., least: float = 0.0, most: float = math.inf) -> float:
+        """A finite number from ``least`` to ``most``; arguments and errors as for `get`."""
 
         def good(value: Any) -> bool:
-            return _is_number(value) and value >= least
+            return _is_number(value) and least <= value <= most
 
         return float(self.get(key, good, meaning, default))
 

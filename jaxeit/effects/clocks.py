@@ -7,6 +7,9 @@ from jaxtyping import Array, Float, Key
 
 from .base import AbstractClockEffect, Packets, StreamKind, parameter
 
+# Limits of `ClockError`: times since 1970 and their sums with delays fit nanoseconds in 64 bits.
+MOST_SKEW, LARGEST_TIME, LONGEST_DELAY = 1.0, 4e9, 3600.0  # 1, s, s
+
 
 class ClockError(AbstractClockEffect):
     """The device's clock runs independently of the host's, and samples arrive late.
@@ -23,11 +26,11 @@ class ClockError(AbstractClockEffect):
     | batch: period of the adapter, 0 for none | 0       | 1e-3 to 16e-3    | s    | assumption: USB serial     |
     """
 
-    skew: Float[Array, ""] = parameter(50e-6, above=-1.0)
-    offset: Float[Array, ""] = parameter(0.0, least=-jnp.inf)
-    latency: Float[Array, ""] = parameter(1e-3)
-    jitter: Float[Array, ""] = parameter(5e-4)
-    batch: Float[Array, ""] = parameter(0.0)
+    skew: Float[Array, ""] = parameter(50e-6, above=-1.0, most=MOST_SKEW)
+    offset: Float[Array, ""] = parameter(0.0, least=-LARGEST_TIME, most=LARGEST_TIME, unit="s")
+    latency: Float[Array, ""] = parameter(1e-3, most=LONGEST_DELAY, unit="s")
+    jitter: Float[Array, ""] = parameter(5e-4, most=LONGEST_DELAY, unit="s")
+    batch: Float[Array, ""] = parameter(0.0, most=LONGEST_DELAY, unit="s")
     stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
     def __call__(self, packets: Packets, key: Key[Array, ""]) -> Packets:

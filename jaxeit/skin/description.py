@@ -109,7 +109,7 @@ class PressureSensor:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A skin's hardware, without physics or meshes.
+    """A skin's hardware, without physics or meshes. Two of them are compared by `skin_hash`.
 
     | meaning                                   | unit           |
     |-------------------------------------------|----------------|

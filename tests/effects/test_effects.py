@@ -252,7 +252,7 @@ def test_an_effect_refuses_a_negative_scatter_length_or_time(effect):
             if value.dtype.kind == "f" or not np.isnan(wrong).any():
                 with pytest.raises(
                     je.effects.EffectError,
-                    match=f"{kind.__name__}: {field.name} is (-1|nan)( m|); give (at least|more than|[01] to) ",
+                    match=f"{kind.__name__}: {field.name} is (-1|nan)( m| s|); give (at least|more than|[01] to) ",
                 ):
                     kind(**{field.name: wrong})
 
@@ -288,6 +288,12 @@ def test_an_effect_refuses_what_cannot_be(name):
     given = {key: np.asarray(value) for key, value in ABSURD[name].items()}
     with pytest.raises(je.effects.EffectError, match=f"{name}: {next(iter(given))} is .*; give "):
         je.effects.EFFECTS[name](**given)
+
+
+@pytest.mark.parametrize("name", ["offset", "latency", "jitter", "batch"])
+def test_a_clock_that_errs_by_more_than_nanoseconds_hold_is_refused(name):
+    with pytest.raises(je.effects.EffectError, match=rf"ClockError: {name} is 1e\+12 s; give "):
+        fx.ClockError(**{name: 1e12})
 
 
 def test_maxwell_elements_that_carry_nothing_are_refused():

@@ -179,6 +179,7 @@ def test_what_cannot_be_exported_is_refused(sources, tmp_path, capsys, monkeypat
     paths, _ = sources
     refused(ExportError, "no force map", tmp_path, [])
     refused(ExportError, "--fps", tmp_path, paths, fps=0)
+    refused(ExportError, "would repeat each force map .* times", tmp_path, paths, fps=1_000_000)
     refused(ExportError, "--full-scale", tmp_path, paths, full_scale=-1.0)
     force_map(tmp_path / "other.h5", [0, S], columns=5)
     refused(ExportError, "other.h5: another skin than that of a.h5", tmp_path, [paths[0], tmp_path / "other.h5"])

@@ -172,6 +172,7 @@ def test_polygons():
         (RECTANGLES, "size = [0.02, 0.01]", "radius = 0.01", r"size: missing; give \[width, height\] in m"),
         (RECTANGLES, "[0.15, 0.05]", "[0.195, 0.05]", r"positions: electrode 1 has a corner at \[0.2.* m, outside"),
         (RECTANGLES, "angle = 0.3", "angle = '17 deg'", "angle: is '17 deg'; give the turn counter-clockwise in rad"),
+        (RECTANGLES, "angle = 0.3", "angle = 45", "angle: is 45; give the turn .* in rad, at most a whole one"),
         (RECTANGLES, "contact = 1e-5", "contact = -1.0", "contact: is -1.0; give ohm m.2"),
         (
             RECTANGLES,

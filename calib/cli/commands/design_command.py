@@ -153,7 +153,7 @@ def _designed(
         better = je.scan.move_electrodes(skin, criterion, limits, settings, pattern=found.pattern, progress=bar).skin
         after = _sensitivity(better, settings)
         found = scan(after)
-    _require_some_accuracy(after, found.pattern)
+    _require_some_accuracy(after, found.pattern, better)
     better = je.skin.with_rows(better, found.pattern, skin.protocol.sense_channels)
     return _Design((skin, better), (before, after), found)
 
@@ -177,12 +177,12 @@ def _sensitivity(skin: "je.Skin", settings: "DesignSettings") -> "PlaceSensitivi
     return found
 
 
-def _require_some_accuracy(sensitivity: "PlaceSensitivity", pattern: "np.ndarray") -> None:
+def _require_some_accuracy(sensitivity: "PlaceSensitivity", pattern: "np.ndarray", skin: "je.Skin") -> None:
     """Refuse a scan that does not tell where on the sheet a contact lies."""
     import numpy as np
 
     error = float(np.mean(np.asarray(sensitivity.errors(pattern))))
-    if error > (most := float(np.ptp(np.asarray(sensitivity.sites), axis=0).max())):
+    if error > (most := float(np.ptp(skin.domain.bounds, axis=0).max())):
         what = f"would have a mean error of place of {1e3 * error:.3g} mm, more than the sheet's {1e3 * most:.3g} mm"
         raise ValueError(f"a scan of {len(pattern)} readings {what}; give a lower --noise, or more --readings")
 

@@ -25,6 +25,7 @@ ROBOT = "jaxeit_skin"
 STATE, VALID, MAP, IMAGE, AGE = (
     f"observation.{name}" for name in ("state", "pad_valid", "force_map", "images.skin", "frame_age")
 )
+MAX_REPEATS = 10  # of each force map, by a rate of frames above its own
 MAX_STRETCH = 100  # of a recording by gaps, which become repeated frames
 ROUND_SCALES = (1.0, 2.0, 5.0, 10.0)
 
@@ -81,6 +82,7 @@ def export_lerobot(
     output, paths = Path(output), paths_of(sources, "export_lerobot", ExportError)
     _require(paths, output, fps, full_scale)
     skins = _skins_of(paths)
+    _require_few_repeats(fps, max(skin.rate for skin in skins))
     fps = fps or max(1, round(min(skin.rate for skin in skins)))
     full_scale = full_scale or rounded_up(max(skin.largest for skin in skins))
     with folder_beside(output) as temporary:
@@ -112,6 +114,15 @@ def _require(sources: Sequence[object], output: Path, fps: int | None, full_scal
         raise ExportError(f"{output}: exists; name another folder, or remove it first")
     if (fps is not None and fps < 1) or (full_scale is not None and not 0 < full_scale < np.inf):
         raise ExportError("lerobot: --fps is a whole number from 1 on, and --full-scale a force above zero, N")
+
+
+def _require_few_repeats(fps: int | None, rate: float) -> None:
+    """Refuse a rate of frames at which most of them would be copies of the force map before, in Hz."""
+    if fps is not None and fps > (most := max(1, round(MAX_REPEATS * rate))):
+        raise ExportError(
+            f"lerobot: --fps {fps} would repeat each force map {fps / rate:,.3g} times, which come at {rate:.3g} Hz; "
+            f"give {most} or less"
+        )
 
 
 def _skins_of(sources: list[Path]) -> list[_Source]:

@@ -99,7 +99,8 @@ class RectanglePatch(PolygonPatch):
         size = table.vector("size", 2, "[width, height] in m")
         if min(size) <= 0:
             raise table.error("size", f"is {list(size)}; give a width and a height in m, above zero")
-        angle = table.number("angle", "the turn counter-clockwise in rad", 0.0, least=-math.inf)
+        turn = 2 * math.pi
+        angle = table.number("angle", "the turn counter-clockwise in rad, at most a whole one", 0.0, -turn, turn)
         corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * size
         along, across = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
         turned = corners[:, :1] * along + corners[:, 1:] * across
