@@ -7,9 +7,9 @@ from .belief.filter import Pads
 from .tracker import Tracker
 from .tracks import Tracking
 
-# A frame this many times as loud as noise is unexpected, whatever the contacts.
-LOUD = 30.0
-SECONDS = 0.01
+# Level of a frame over that of noise, with which it is unexpected whatever the contacts; seconds between frames.
+FRAME_LEVEL = 30.0
+FRAME_PERIOD = 0.01
 
 
 def compile_tracker(tracker: Tracker) -> None:
@@ -25,14 +25,14 @@ def compile_tracker(tracker: Tracker) -> None:
     places, belief = np.asarray(finder.starts)[:, :2], start.belief
     frame = np.random.default_rng(0).normal(size=finder.readings)
     whitened = np.asarray(tracker.filter.compress) @ frame
-    frame *= LOUD / np.sqrt(np.mean(whitened**2))
+    frame *= FRAME_LEVEL / np.sqrt(np.mean(whitened**2))
     most, pads = tracker.settings.most, tracker.filter.sheet.pad_area.shape[1]
-    tracker.step(start, 0 * frame, SECONDS)  # without forces on pads
+    tracker.step(start, 0 * frame, FRAME_PERIOD)  # without forces on pads
     for count in range(most + 1):
         numbers = tuple(range(1, count + 1))
         now = Tracking(belief, start.layer, numbers, (False,) * count, (0,) * count, count, taught=count)
-        tracker.step(now, frame, SECONDS, np.zeros(pads), np.ones(pads))
-        tracker.programs.predicted(belief, SECONDS)
+        tracker.step(now, frame, FRAME_PERIOD, np.zeros(pads), np.ones(pads))
+        tracker.programs.predict(belief, FRAME_PERIOD)
         if count:
             tracker.programs.consider_covariance(belief, Pads(jnp.zeros(pads), jnp.ones(pads)), 0.0)
         belief = tracker.events.with_contact(belief, places[count * len(places) // (most + 1)])

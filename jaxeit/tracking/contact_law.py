@@ -22,15 +22,15 @@ from ..contacts.loads.settings import LoadSettings
 from ..imaging.noise import InverseError
 from .tracks import Track
 
-# Prior standard deviations of a, b and c, and prior scatter of e, which counts as `SHAPE` times two contacts.
-SPREAD, SCATTER, SHAPE = np.array([1.0, 1.0, 2.0]), 0.3, 1.5
-# Contacts, and log of the ratio of probabilities of their forces with and without the law, from which it is believed:
-# 20 to 1.
-FEWEST, SURE = 5, 3.0
-# How far beyond the logs of force and width from which it was learned the law holds; its largest log factor; and the
-# least slope 1 + b, below which readings hardly tell a force.
-BEYOND, MAX_LOG_FACTOR, LEAST_SLOPE = 0.5, 3.0, 0.3
-USUAL = np.log([LoadSettings.force, LoadSettings.width])
+# Prior standard deviations of a, b and c, and prior scatter of e, which counts as `PRIOR_SHAPE` times two contacts.
+PRIOR_STD, PRIOR_SCATTER, PRIOR_SHAPE = np.array([1.0, 1.0, 2.0]), 0.3, 1.5
+# Smallest number of contacts, and smallest log of the ratio of probabilities of their forces with and without the law,
+# with which the law is used: 20 to 1.
+MIN_CONTACTS, MIN_LOG_RATIO = 5, 3.0
+# Range beyond the logs of force and width of the contacts learned from, in which the law is extrapolated; its largest
+# log factor; and its smallest slope 1 + b, below which readings hardly inform on a force.
+EXTRAPOLATION, MAX_LOG_FACTOR, MIN_SLOPE = 0.5, 3.0, 0.3
+REFERENCE_LOGS = np.log([LoadSettings.force, LoadSettings.width])
 
 
 class ContactLaw(NamedTuple):
@@ -70,8 +70,9 @@ class ContactLaw(NamedTuple):
     @classmethod
     def unknown(cls) -> "ContactLaw":
         """Nothing is learned."""
-        rate = SHAPE * SCATTER**2
-        return cls(np.zeros(3), np.diag((SPREAD / SCATTER) ** 2), SHAPE, rate, rate, 0.0, USUAL, USUAL)
+        rate = PRIOR_SHAPE * PRIOR_SCATTER**2
+        covariance = np.diag((PRIOR_STD / PRIOR_SCATTER) ** 2)
+        return cls(np.zeros(3), covariance, PRIOR_SHAPE, rate, rate, 0.0, REFERENCE_LOGS, REFERENCE_LOGS)
 
     @property
     def is_better(self) -> bool:
@@ -80,12 +81,12 @@ class ContactLaw(NamedTuple):
 
         Where the law of the model is right this stays false, and nothing is changed.
         """
-        return self.contacts >= FEWEST and self.evidence > SURE
+        return self.contacts >= MIN_CONTACTS and self.evidence > MIN_LOG_RATIO
 
     @property
     def slope(self) -> float:
         """Slope 1 + b of the log force that readings alone tell, over the log of the true force."""
-        return max(1 + float(self.mean[1]), LEAST_SLOPE)
+        return max(1 + float(self.mean[1]), MIN_SLOPE)
 
     @property
     def scatter(self) -> float:
@@ -114,21 +115,22 @@ class ContactLaw(NamedTuple):
         if not (0 < force < math.inf and 0 < seen.force < math.inf):
             raise InverseError(f"forces {seen.force} and {force} N do not tell a law; give numbers above zero")
         row, error = np.log([force, seen.width]), math.log(seen.force / force)
-        x = _terms(row)
-        along = self.covariance @ x
-        spread, left = 1 + float(x @ along), error - float(x @ self.mean)
-        # What a frame tells is believed only as far as it was predicted: each contact is judged before it teaches.
-        gained = _log_student(left, self.shape, self.rate, spread) - _log_student(error, self.shape, self.plain, 1.0)
-        begun = self.contacts > 0
+        x = _regressors(row)
+        cross = self.covariance @ x
+        spread, residual = 1 + float(x @ cross), error - float(x @ self.mean)
+        # Evidence is that of predictions: each contact is predicted by the law before it changes the law.
+        log_density = _log_student(residual, self.shape, self.rate, spread)
+        log_density_without = _log_student(error, self.shape, self.plain, 1.0)
+        learned = self.contacts > 0
         return ContactLaw(
-            mean=self.mean + along * left / spread,
-            covariance=self.covariance - np.outer(along, along) / spread,
+            mean=self.mean + cross * residual / spread,
+            covariance=self.covariance - np.outer(cross, cross) / spread,
             shape=self.shape + 0.5,
-            rate=self.rate + 0.5 * left**2 / spread,
+            rate=self.rate + 0.5 * residual**2 / spread,
             plain=self.plain + 0.5 * error**2,
-            evidence=self.evidence + gained,
-            low=np.minimum(self.low, row) if begun else row,
-            high=np.maximum(self.high, row) if begun else row,
+            evidence=self.evidence + (log_density - log_density_without),
+            low=np.minimum(self.low, row) if learned else row,
+            high=np.maximum(self.high, row) if learned else row,
             contacts=self.contacts + 1,
         )
 
@@ -136,13 +138,13 @@ class ContactLaw(NamedTuple):
         """After a time in which this share of what was learned, from 0 to 1, has been forgotten."""
         if not 0 <= share <= 1:
             raise InverseError(f"the share that is forgotten is {share}; give 0 to 1")
-        kept, before = 1 - share, ContactLaw.unknown()
+        kept, prior = 1 - share, ContactLaw.unknown()
         return self._replace(
             mean=kept * self.mean,
-            covariance=before.covariance + kept**2 * (self.covariance - before.covariance),
-            shape=before.shape + kept * (self.shape - before.shape),
-            rate=before.rate + kept * (self.rate - before.rate),
-            plain=before.plain + kept * (self.plain - before.plain),
+            covariance=prior.covariance + kept**2 * (self.covariance - prior.covariance),
+            shape=prior.shape + kept * (self.shape - prior.shape),
+            rate=prior.rate + kept * (self.rate - prior.rate),
+            plain=prior.plain + kept * (self.plain - prior.plain),
             evidence=kept * self.evidence,
         )
 
@@ -154,12 +156,12 @@ class ContactLaw(NamedTuple):
         """
         if not self.is_better:
             return track
-        seen, width = np.log([track.force, track.width]) - USUAL
-        low, high = self.low - USUAL - BEYOND, self.high - USUAL + BEYOND
+        seen, width = np.log([track.force, track.width]) - REFERENCE_LOGS
+        low, high = self.low - REFERENCE_LOGS - EXTRAPOLATION, self.high - REFERENCE_LOGS + EXTRAPOLATION
         width = float(np.clip(width, low[1], high[1]))
-        within = float(np.clip((seen - self.mean[0] - self.mean[2] * width) / self.slope, low[0], high[0]))
-        factor = -(self.mean[0] + (self.slope - 1) * within + self.mean[2] * width)
-        x = np.array([1.0, within, width])
+        log_force = float(np.clip((seen - self.mean[0] - self.mean[2] * width) / self.slope, low[0], high[0]))
+        factor = -(self.mean[0] + (self.slope - 1) * log_force + self.mean[2] * width)
+        x = np.array([1.0, log_force, width])
         error = self.scatter * math.sqrt(1 + float(x @ self.covariance @ x)) / self.slope
         force = track.force * math.exp(float(np.clip(factor, -MAX_LOG_FACTOR, MAX_LOG_FACTOR)))
         return track._replace(force=force, log_force_error=error)
@@ -169,13 +171,13 @@ class ContactLaw(NamedTuple):
         return tuple(one if known else self.applied(one) for one, known in zip(tracks, told, strict=True))
 
 
-def _terms(row: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
+def _regressors(row: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3"]:
     """Factors of a, b and c at logs of force and width."""
-    return np.array([1.0, *(row - USUAL)])
+    return np.array([1.0, *(row - REFERENCE_LOGS)])
 
 
-def _log_student(left: float, shape: float, rate: float, spread: float) -> float:
+def _log_student(residual: float, shape: float, rate: float, spread: float) -> float:
     """Log density of an error whose variance is ``spread`` times that of e, over all variances of e."""
     scale = 2 * rate * spread
     ratio = math.lgamma(shape + 0.5) - math.lgamma(shape) - 0.5 * math.log(math.pi * scale)
-    return ratio - (shape + 0.5) * math.log1p(left**2 / scale)
+    return ratio - (shape + 0.5) * math.log1p(residual**2 / scale)

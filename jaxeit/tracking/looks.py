@@ -21,229 +21,238 @@ import numpy as np
 from .belief.filter import CONTACT_SIZE, Update
 from .belief.programs import Programs
 from .events import Events, Hypothesis
-from .tracks import MOST_PATIENCE, PATIENCE, Backlog, Look, Seen, Tracking, Trial
+from .tracks import MAX_PATIENCE, PATIENCE, Backlog, Look, Observation, Tracking, Trial
 
-# A contact dies after as many frames in which its signal is below so many standard deviations of the noise.
-FAINT, FAINT_FRAMES = 4.0, 2
-# Signal of a contact that begins beside others, at least: in standard deviations of the noise, and over that of all.
-MIN_LOUDNESS, RIPPLE = 12.0, 0.05
-# Contacts may be fewer where the log of a force has a larger standard deviation. They are counted again so many times
-# as often as a frame that no event explains is looked into.
-DOUBTED, DOUBTS = 0.5, 4
-# Frames that wait while another is looked into; where there are more, each stands for two. An even number.
-KEPT = 8
-# Events that one frame may show.
-EVENTS = 4
-# A look is given up when frames of so many seconds wait: contacts that moved on unseen for so long are not believed.
-LONGEST_WAIT = 2.0
+# Signal-to-noise ratio below which a contact is faint, and number of such frames after which it dies.
+FAINT_SIGNAL, FAINT_FRAMES = 4.0, 2
+# Smallest signal-to-noise ratio of a contact that is born beside others, and its smallest share of that of all others.
+MIN_BIRTH_SIGNAL, MIN_BIRTH_SHARE = 12.0, 0.05
+# Standard deviation of the log of a force above which a contact is doubtful, and rate of recounts over that of looks
+# into a frame that no event explains.
+DOUBTFUL_STD, RECOUNT_RATE = 0.5, 4
+# Largest number of frames that wait while another is looked into; where there are more, each stands for two. Even.
+MAX_WAITING = 8
+# Largest number of events in one frame.
+MAX_EVENTS = 4
+# Longest time of waiting frames, s, after which a look is abandoned: contacts that moved for so long are not known.
+MAX_WAIT = 2.0
 
 
-def begun(before: Tracking, otherwise: Tracking, seen: Seen, unfinished: bool = False) -> Look:
-    """Begin to look into a frame: contacts as they were predicted, and as the frame leaves them if nothing happened.
+def begin_look(before: Tracking, uneventful: Tracking, observation: Observation, unconverged: bool = False) -> Look:
+    """Begin to look into a frame.
 
     Args:
+        before: contacts as they were predicted.
+        uneventful: contacts after the frame if nothing happened.
         unfinished: whether the update that led to the latter had not converged.
     """
-    return Look(seen, before, otherwise, Trial(_as_is(before)), EVENTS, unfinished)
+    return Look(observation, before, uneventful, Trial(_unchanged(before)), MAX_EVENTS, unconverged)
 
 
-def is_doubted(now: Tracking) -> bool:
-    """Whether contacts are to be counted again: the force of one beside others is hardly known."""
-    return len(now.numbers) > 1 and now.since >= now.patience // DOUBTS and bool(_doubted(now))
+def needs_recount(now: Tracking) -> bool:
+    """Whether contacts are to be counted again, since the force of one beside others is hardly known."""
+    return len(now.numbers) > 1 and now.since >= now.patience // RECOUNT_RATE and bool(_doubtful_contacts(now))
 
 
-def _doubted(now: Tracking) -> list[int]:
-    """Which contacts may be none."""
+def _doubtful_contacts(now: Tracking) -> list[int]:
+    """Indices of the contacts that may be none."""
     forces = CONTACT_SIZE * np.arange(len(now.numbers)) + 3
     errors = np.sqrt(np.diag(np.asarray(now.belief.covariance))[forces])
-    return [k for k, error in enumerate(errors) if error > DOUBTED and not now.edges[k]]
+    return [k for k, error in enumerate(errors) if error > DOUBTFUL_STD and not now.edges[k]]
 
 
-def recounted(before: Tracking, otherwise: Tracking, seen: Seen, programs: Programs, events: Events) -> Look:
-    """Begin to look whether one contact fewer explains a frame; arguments as for `begun`."""
-    places, anew = np.asarray(before.belief.contacts)[:, :2], _as_is(before)
-    for k, place in enumerate(places):
-        anew = events.elsewhere(anew, k, place)
+def begin_recount(
+    before: Tracking, uneventful: Tracking, observation: Observation, programs: Programs, events: Events
+) -> Look:
+    """Begin to compare one contact fewer with all contacts in a frame; arguments as for `begin_look`."""
+    positions, reborn = np.asarray(before.belief.contacts)[:, :2], _unchanged(before)
+    for k, position in enumerate(positions):
+        reborn = events.relocate(reborn, k, position)
 
-    def fewer(k: int) -> Trial:
-        """One contact in the place of contact k and the one beside it."""
-        beside = int(np.argsort(np.linalg.norm(places - places[k], axis=1))[1])
-        first, second = sorted((k, beside))
-        left = anew.without(second, 0.0)
-        place = programs.unexplained_place(left.without(first, 0.0).belief, seen.dv, seen.pads)
-        return Trial(events.elsewhere(left, first, place))
+    def merged(k: int) -> Trial:
+        """One contact in place of contact k and its nearest neighbour."""
+        neighbour = int(np.argsort(np.linalg.norm(positions - positions[k], axis=1))[1])
+        first, second = sorted((k, neighbour))
+        rest = reborn.without(second, 0.0)
+        position = programs.birth_position(rest.without(first, 0.0).belief, observation.dv, observation.pads)
+        return Trial(events.relocate(rest, first, position))
 
-    best = Trial(anew._replace(prior=events.anywhere(seen.seconds)))
-    return Look(seen, before, otherwise, best, EVENTS, trials=tuple(map(fewer, _doubted(before))))
+    best = Trial(reborn._replace(prior=events.birth_log_prior(observation.seconds)))
+    trials = tuple(map(merged, _doubtful_contacts(before)))
+    return Look(observation, before, uneventful, best, MAX_EVENTS, trials=trials)
 
 
-def meanwhile(backlog: Backlog, seen: Seen) -> Backlog:
-    """A frame has come while others wait."""
+def queue_frame(backlog: Backlog, observation: Observation) -> Backlog:
+    """Queue a frame behind others that wait."""
     waiting = backlog.waiting
     if backlog.look is None:
-        waiting = _merged(waiting[:2]) + waiting[2:]  # else a frame more would come for each that is followed
-    elif len(waiting) >= KEPT:
-        waiting = _merged(waiting)
-    return replace(backlog, waiting=(*waiting, seen))
+        waiting = _merge_pairs(waiting[:2]) + waiting[2:]  # else a frame more would come for each that is followed
+    elif len(waiting) >= MAX_WAITING:
+        waiting = _merge_pairs(waiting)
+    return replace(backlog, waiting=(*waiting, observation))
 
 
-def caught_up(now: Tracking, backlog: Backlog, seen: Seen) -> tuple[Tracking, Seen]:
-    """Where one frame waits and none is looked into, the frame that has come stands for both.
+def catch_up(now: Tracking, backlog: Backlog, observation: Observation) -> tuple[Tracking, Observation]:
+    """Let a new frame stand for the one that waits too, where only one waits and none is looked into.
 
-    Else one would wait for ever where a piece is done after each frame.
+    Otherwise one would wait for ever where a piece is done after each frame.
     """
     if backlog.look is not None or len(backlog.waiting) > 1:
-        return now, seen
-    return backlog.before, seen._replace(seconds=seen.seconds + sum(one.seconds for one in backlog.waiting))
+        return now, observation
+    return backlog.before, observation._replace(
+        seconds=observation.seconds + sum(one.seconds for one in backlog.waiting)
+    )
 
 
-def is_given_up(backlog: Backlog) -> bool:
-    """Whether so many frames wait that no spare time can be hoped for, as on a machine that is too slow or too busy."""
-    return sum(seen.seconds for seen in backlog.waiting) > LONGEST_WAIT
+def is_overdue(backlog: Backlog) -> bool:
+    """Whether frames have waited for longer than `MAX_WAIT`, as on a machine that is too slow or too busy."""
+    return sum(observation.seconds for observation in backlog.waiting) > MAX_WAIT
 
 
-def _merged(frames: tuple[Seen, ...]) -> tuple[Seen, ...]:
-    """Every other frame, with the seconds of both."""
+def _merge_pairs(frames: tuple[Observation, ...]) -> tuple[Observation, ...]:
+    """Merge pairs of frames: the second of each, with the seconds of both."""
     if len(frames) < 2:
         return frames
     pairs = zip(frames[::2], frames[1::2], strict=True)
     return tuple(second._replace(seconds=first.seconds + second.seconds) for first, second in pairs)
 
 
-def _as_is(now: Tracking) -> Hypothesis:
+def _unchanged(now: Tracking) -> Hypothesis:
     return Hypothesis(now.belief, now.numbers, now.edges)
 
 
-def looked(look: Look, programs: Programs, events: Events) -> Look:
-    """A piece more of a look, until it knows the contacts after its frame."""
+def advance_look(look: Look, programs: Programs, events: Events) -> Look:
+    """Advance a look by one piece, until it has the contacts after its frame."""
     if not look.best.ended:
-        return replace(look, best=_further(look.best, look.seen, programs))
+        return replace(look, best=_advance_trial(look.best, look.observation, programs))
     if look.trials is None:
-        careful = _concluded(look, look.best, programs)
-        if _is_explained(careful, programs.size, events.rare(look.seen.seconds)):
-            return replace(look, after=_uneventful(look, programs, careful))
-        return replace(look, trials=_trials(look, careful, programs, events))
-    best = max(trial.probability for trial in [look.best, *_possible(look)])
+        careful = _conclude(look, look.best, programs)
+        if _is_explained(careful, programs.size, events.event_log_prior(look.observation.seconds)):
+            return replace(look, after=_without_event(look, programs, careful))
+        return replace(look, trials=_event_trials(look, careful, programs, events))
+    best = max(trial.log_probability for trial in [look.best, *_admissible_trials(look)])
     for k, trial in enumerate(look.trials):
         if not (trial.ended or trial.is_hopeless(best)):
-            trials = (*look.trials[:k], _further(trial, look.seen, programs), *look.trials[k + 1 :])
+            trials = (*look.trials[:k], _advance_trial(trial, look.observation, programs), *look.trials[k + 1 :])
             return replace(look, trials=trials)
-    return _judged(look, programs)
+    return _decide(look, programs)
 
 
-def _further(trial: Trial, seen: Seen, programs: Programs) -> Trial:
-    return trial._replace(attempt=programs.attempted(trial.event.belief, seen.dv, seen.pads, trial.attempt))
+def _advance_trial(trial: Trial, observation: Observation, programs: Programs) -> Trial:
+    return trial._replace(
+        attempt=programs.advance(trial.hypothesis.belief, observation.dv, observation.pads, trial.attempt)
+    )
 
 
-def _is_explained(careful: Update, size: int, rare: float) -> bool:
+def _is_explained(careful: Update, size: int, log_prior: float) -> bool:
     """Whether no event is more probable than none, even one that would leave only noise of a frame.
 
     Args:
         size: number of whitened readings.
-        rare: log of the prior probability of an event.
+        log_prior: of an event.
     """
-    gained = 0.5 * (float(careful.misfit) - size + float(careful.surprise))
-    return is_finite(careful) and gained + rare < 0
+    gain = 0.5 * (float(careful.misfit) - size + float(careful.correction_square))
+    return is_finite(careful) and gain + log_prior < 0
 
 
-def _trials(look: Look, careful: Update, programs: Programs, events: Events) -> tuple[Trial, ...]:
-    """What may have happened."""
-    before, seen = _as_is(look.before), look.seen
-    place = programs.unexplained_place(careful.belief, seen.dv, seen.pads)
+def _event_trials(look: Look, careful: Update, programs: Programs, events: Events) -> tuple[Trial, ...]:
+    """Trials of the events that may have happened."""
+    before, observation = _unchanged(look.before), look.observation
+    place = programs.birth_position(careful.belief, observation.dv, observation.pads)
     others = [before.without(k, 0.0).belief for k in range(len(before.numbers))]
-    instead = [programs.unexplained_place(belief, seen.dv, seen.pads) for belief in others]
-    return tuple(map(Trial, events.possible(before, look.before.begun, place, instead, seen.seconds)))
+    alternatives = [programs.birth_position(belief, observation.dv, observation.pads) for belief in others]
+    return tuple(map(Trial, events.hypotheses(before, look.before.begun, place, alternatives, observation.seconds)))
 
 
-def _concluded(look: Look, trial: Trial, programs: Programs) -> Update:
+def _conclude(look: Look, trial: Trial, programs: Programs) -> Update:
     assert trial.attempt is not None
-    return programs.concluded(trial.event.belief, look.seen.dv, look.seen.pads, trial.attempt)
+    return programs.conclude(trial.hypothesis.belief, look.observation.dv, look.observation.pads, trial.attempt)
 
 
-def _possible(look: Look) -> list[Trial]:
-    """Trials that have ended and may be what has happened."""
-    return [trial for trial in look.trials or () if trial.ended and not _is_ripple(look.before, trial)]
+def _admissible_trials(look: Look) -> list[Trial]:
+    """Trials that have ended and are not spurious."""
+    return [trial for trial in look.trials or () if trial.ended and not _is_spurious(look.before, trial)]
 
 
-def _most_probable(look: Look) -> Trial:
-    return max([look.best, *_possible(look)], key=lambda trial: trial.probability)
+def _most_probable_trial(look: Look) -> Trial:
+    return max([look.best, *_admissible_trials(look)], key=lambda trial: trial.log_probability)
 
 
-def _judged(look: Look, programs: Programs) -> Look:
-    """The look after the most probable event; the end of it if this is that nothing more has happened."""
-    best = _most_probable(look)
+def _decide(look: Look, programs: Programs) -> Look:
+    """Decide for the most probable event; end the look if this is that nothing more has happened."""
+    best = _most_probable_trial(look)
     if best is look.best or best.attempt is None:
-        after = _uneventful(look, programs)
-        return replace(look, after=calmer(after) if look.events == EVENTS else after)
-    event = best.event
-    update = _concluded(look, best, programs)
-    before = look.before.under(event, event.belief)
-    after = settled(replace(before, since=0, patience=PATIENCE, misfit=float(update.misfit)), update)
-    best, left = best._replace(event=event._replace(prior=0.0)), look.events - 1
-    look = replace(look, before=before, best=best, otherwise=after, events=left, unfinished=False, trials=None)
+        after = _without_event(look, programs)
+        return replace(look, after=extend_patience(after) if look.events == MAX_EVENTS else after)
+    hypothesis = best.hypothesis
+    update = _conclude(look, best, programs)
+    before = look.before.under(hypothesis, hypothesis.belief)
+    after = apply_update(replace(before, since=0, patience=PATIENCE, misfit=float(update.misfit)), update)
+    best, left = best._replace(hypothesis=hypothesis._replace(prior=0.0)), look.events - 1
+    look = replace(look, before=before, best=best, uneventful=after, events=left, unconverged=False, trials=None)
     return look if left else replace(look, after=after)
 
 
-def _uneventful(look: Look, programs: Programs, careful: Update | None = None) -> Tracking:
-    """Contacts to which nothing more has happened: by the careful update, if the ordinary one ended before it was best.
+def _without_event(look: Look, programs: Programs, careful: Update | None = None) -> Tracking:
+    """Contacts after no further event: by the careful update, if the ordinary one had not converged and fits worse.
 
     Where a force grows severalfold between two frames, the few evaluations of an ordinary update end before the force
     is found, and the gain explains the rest of the frame.
     """
-    if not look.unfinished:
-        return look.otherwise
-    careful = _concluded(look, look.best, programs) if careful is None else careful
-    if not float(careful.misfit) < look.otherwise.misfit:
-        return look.otherwise
-    return settled(replace(look.before, since=0, misfit=float(careful.misfit)), careful)
+    if not look.unconverged:
+        return look.uneventful
+    careful = _conclude(look, look.best, programs) if careful is None else careful
+    if not float(careful.misfit) < look.uneventful.misfit:
+        return look.uneventful
+    return apply_update(replace(look.before, since=0, misfit=float(careful.misfit)), careful)
 
 
-def calmer(after: Tracking) -> Tracking:
-    """Contacts to which nothing has happened, although a frame looked like it."""
-    return replace(after, patience=min(2 * after.patience, MOST_PATIENCE))
+def extend_patience(after: Tracking) -> Tracking:
+    """Wait for longer before the next look, as no event explained this frame."""
+    return replace(after, patience=min(2 * after.patience, MAX_PATIENCE))
 
 
-def _is_ripple(before: Tracking, trial: Trial) -> bool:
-    """Whether a contact beside others would begin so weak that it may be an error of their model."""
+def _is_spurious(before: Tracking, trial: Trial) -> bool:
+    """Whether a contact born beside others is so weak that it may be an error of their model."""
     assert trial.attempt is not None
-    born = len(trial.event.numbers) > len(before.numbers) > 0
-    loudness = np.asarray(trial.attempt.loudness)
-    return born and bool(loudness[-1] < max(MIN_LOUDNESS, RIPPLE * loudness[:-1].sum()))
+    born = len(trial.hypothesis.numbers) > len(before.numbers) > 0
+    signal = np.asarray(trial.attempt.signal_to_noise)
+    return born and bool(signal[-1] < max(MIN_BIRTH_SIGNAL, MIN_BIRTH_SHARE * signal[:-1].sum()))
 
 
-def settled(now: Tracking, update: Update) -> Tracking:
-    """The contacts after an update, without those that are no longer seen.
+def apply_update(now: Tracking, update: Update) -> Tracking:
+    """Apply an update, and remove contacts that have been faint for too long.
 
-    Without any if the update is not finite, as where rounding has left a covariance indefinite: the gain stays known,
-    and contacts begin anew.
+    All are removed if the update is not finite, as where rounding has left a covariance indefinite: the gain stays
+    known, and contacts begin anew.
     """
     if not is_finite(update):
-        return without_contacts(now)
-    loudness = np.asarray(update.loudness)
-    faint = tuple(count + 1 if own < FAINT else 0 for count, own in zip(now.faint, loudness, strict=True))
+        return remove_contacts(now)
+    signal = np.asarray(update.signal_to_noise)
+    faint = tuple(count + 1 if own < FAINT_SIGNAL else 0 for count, own in zip(now.faint, signal, strict=True))
     now = replace(now, belief=update.belief, faint=faint)
     for k in reversed(range(len(faint))):
         if faint[k] >= FAINT_FRAMES:
-            left = _as_is(now).without(k, 0.0)
+            left = _unchanged(now).without(k, 0.0)
             now = now.under(left, left.belief)
     return now
 
 
 def is_finite(update: Update) -> bool:
-    """Whether an update can be believed."""
+    """Whether an update is finite."""
     belief = update.belief
     numbers = (update.evidence, belief.contacts, belief.gain, np.diag(np.asarray(belief.covariance)))
     return all(bool(np.isfinite(np.asarray(one)).all()) for one in numbers)
 
 
-def has_ended(update: Update) -> bool:
-    """Whether an update can be believed, and has converged."""
+def has_converged(update: Update) -> bool:
+    """Whether an update is finite and has converged."""
     return is_finite(update) and bool(update.converged)
 
 
-def without_contacts(now: Tracking) -> Tracking:
-    """No contact is believed in any longer; the gain stays known."""
-    left = _as_is(now)
+def remove_contacts(now: Tracking) -> Tracking:
+    """Remove all contacts; the gain stays known."""
+    left = _unchanged(now)
     while left.numbers:
         left = left.without(0, 0.0)
     return now.under(left, left.belief)

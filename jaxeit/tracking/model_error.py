@@ -15,8 +15,8 @@ from ..imaging.noise import InverseError, require_real
 from ..kinds import require_unmasked
 from .belief.filter import Pads
 from .belief.layer import LearnedLayer
-from .looks import has_ended
-from .preparation import MESH_GAIN
+from .looks import has_converged
+from .preparation import MESH_ERROR_RATIO
 from .tracker import Tracker
 
 
@@ -47,13 +47,14 @@ def fit_model_error(
         print(humble.settings.loads.model_error, tracking.press_evidence(humble, presses))
     """
     require_known("fit_model_error", InverseError, dv, pad_forces, pad_errors)
-    seen = _seen(tracker, dv, pad_forces, pad_errors)
-    tried = cache(partial(_with_model_error, tracker))  # most presses ask for the first few
+    observations = _observations(tracker, dv, pad_forces, pad_errors)
+    tracker_with = cache(partial(_with_model_error, tracker))  # most presses ask for the first few
 
     def evidence(frame: np.ndarray, pads: Pads, error: float) -> float:
-        return _evidence(tried(error), frame, pads)
+        return _evidence(tracker_with(error), frame, pads)
 
-    return tried(fitted_model_error([partial(evidence, *one) for one in seen], tracker.settings.loads.model_error))
+    evidences = [partial(evidence, *one) for one in observations]
+    return tracker_with(fitted_model_error(evidences, tracker.settings.loads.model_error))
 
 
 def press_evidence(
@@ -72,12 +73,12 @@ def press_evidence(
         layer: as for `Tracker.start`.
     """
     require_known("press_evidence", InverseError, dv, pad_forces, pad_errors)
-    seen = _seen(tracker, dv, pad_forces, pad_errors)
+    observations = _observations(tracker, dv, pad_forces, pad_errors)
     before = tracker.start(layer).belief
-    return np.array([float(tracker.press_update(before, frame, pads).evidence) for frame, pads in seen])
+    return np.array([float(tracker.press_update(before, frame, pads).evidence) for frame, pads in observations])
 
 
-def _seen(
+def _observations(
     tracker: Tracker, dv: ArrayLike, pad_forces: ArrayLike | None, pad_errors: ArrayLike | None
 ) -> list[tuple[np.ndarray, Pads]]:
     require_real(dv=dv)
@@ -95,9 +96,9 @@ def _seen(
 def _with_model_error(tracker: Tracker, error: float) -> Tracker:
     settings = replace(tracker.settings, loads=replace(tracker.settings.loads, model_error=error))
     value = jnp.asarray(error, tracker.filter.model_error.dtype)
-    filters = tracker.filter, tracker.of_presses
+    filters = tracker.filter, tracker.press_filter
     followed, single = (eqx.tree_at(lambda one: one.model_error, each, value) for each in filters)
-    field = replace(tracker.field, mesh_error=MESH_GAIN * error)
+    field = replace(tracker.field, mesh_error=MESH_ERROR_RATIO * error)
     return Tracker(followed, single, settings, tracker.area, field)
 
 
@@ -110,13 +111,13 @@ def _evidence(tracker: Tracker, frame: Float[np.ndarray, " readings"], pads: Pad
     """
     programs, before = tracker.programs, tracker.start().belief
     press = tracker.press_update(before, frame, pads)
-    if not has_ended(press):
+    if not has_converged(press):
         return -np.inf
     begin = tracker.events.with_contact(before, np.asarray(press.belief.contacts)[0, :2])
     # The frames of a tracker reach less far than a single press, and the error is to hold what that leaves out.
-    update = programs.careful(begin, frame, pads)
-    if not has_ended(update):
+    update = programs.single_frame_update(begin, frame, pads)
+    if not has_converged(update):
         return -np.inf
-    left = programs.unexplained(before, frame, pads)  # y / s, with s^2 = 1 + e |y|^2 / n, e = error_share
+    left = programs.innovation(before, frame, pads)  # y / s, with s^2 = 1 + e |y|^2 / n, e = error_share
     share = 1 - float(tracker.filter.error_share) * float(left @ left) / len(left)  # 1 / s^2
     return float(update.evidence) + 0.5 * len(left) * float(np.log(share))

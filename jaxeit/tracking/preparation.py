@@ -26,28 +26,28 @@ from ..model.scene import Scene
 from ..model.sensitivity import pair_jacobian
 from ..skin.description import Skin
 from .belief.apparent_gain import apparent_gain
-from .belief.filter import CONTACT_SIZE, PLACE_STD, ContactFilter
+from .belief.filter import CONTACT_SIZE, POSITION_STD, ContactFilter
 from .belief.layer import GainField
 from .belief.reanalysis import prepare_reanalysis
-from .belief.response import LoadedSheet, Neighbours, half_lengths
+from .belief.response import LoadedSheet, NeighbourTable, edge_half_lengths
 from .settings import TrackerSettings
 
 # Cells of the grid of neighbours, along the longer side.
-GRID = 20
-# How many times as many modes, unknowns and pixels the fit of a single press takes as a frame that is followed. Such a
-# fit may end a centimetre from where it began, and is not done again there: what it left out it would take for gain.
-PRESS_REACH = 2.5
-# Log gain that what a mesh errs by at a place looks like, to the model error: a contact's signal errs by about as much,
-# and its place and width take part of that away and add to the rest.
-MESH_GAIN = 2.0
+GRID_CELLS = 20
+# Number of modes, unknowns and pixels in the fit of a single press, over that in a frame of the filter. Such a fit may
+# end a centimetre from its start, and is not repeated there: what it left out it would take for gain.
+PRESS_REACH_RATIO = 2.5
+# Apparent log gain by the error of a mesh at a place, over the model error: a contact's signal errs by about as much,
+# and its place and width explain a part of that and add to the rest.
+MESH_ERROR_RATIO = 2.0
 # Share of the variance of an unknown coat that its modes hold.
-COAT_VARIANCE = 0.99
-# Usual loads along each side of the sheet, of which an unknown coat changes the signal.
-COAT_PLACES = 5
+COAT_VARIANCE_SHARE = 0.99
+# Number of usual loads along each side of the sheet, at which the error by an unknown coat is computed.
+COAT_GRID = 5
 # Square of a half length, m^2, below which a load is round.
-TINY = 1e-12
-# Pixels of the first order to the usual width of a load; least and largest number of them along x.
-PIXELS_A_WIDTH, LEAST_MOST_COLUMNS = 3, (12, 150)
+MIN_SQUARED_LENGTH = 1e-12
+# Pixels of the first order per usual width of a load; limits of their number along x.
+PIXELS_PER_WIDTH, COLUMN_LIMITS = 3, (12, 150)
 
 
 @full_precision
@@ -70,25 +70,25 @@ def prepare_filter(
     coat = loads.coat_spread(sigma is not None)
     field, sheet, around = _loaded_sheet(model, skin, settings, whole, coat, found.electrodes, kept @ found.factor)
     unit = put(np.eye(len(finder.whitening.channels)))
-    far = _reaching(settings)
+    far = _press_settings(settings)
     tracker = ContactFilter(
         finder=finder,
         compress=finder.whitening.sums(unit).dot(finder.compress.T).T,
         sheet=sheet,
         places=put(field.places),
         model_error=put(loads.model_error),
-        coat_error=put(_coat_share(sheet, settings) if coat else 0),
+        coat_error=put(_coat_error(sheet, settings) if coat else 0),
         persistence=put(settings.persistence),
         rates=put(_rates(settings)),
         gain_rate=put(settings.gain_rate / settings.level),
         tail=put(settings.tail),
         shape=put(loads.shape),
-        spread=put([PLACE_STD, PLACE_STD, loads.width_spread, loads.force_spread]),
+        spread=put([POSITION_STD, POSITION_STD, loads.width_spread, loads.force_spread]),
         active_modes=settings.modes,
     )
-    doubted = sheet if untouched is None else with_errors(sheet, model, untouched.errors)
-    by_sheet = apparent_gain(tracker, doubted, np.log([loads.width, loads.force]), loads.gain_length)
-    field = replace(field, sheet_error=by_sheet, mesh_error=MESH_GAIN * loads.model_error)
+    with_errors = sheet if untouched is None else with_sheet_errors(sheet, model, untouched.errors)
+    by_sheet = apparent_gain(tracker, with_errors, np.log([loads.width, loads.force]), loads.gain_length)
+    field = replace(field, sheet_error=by_sheet, mesh_error=MESH_ERROR_RATIO * loads.model_error)
     return tracker, replace(tracker, sheet=replace(sheet, neighbours=around), active_modes=far.modes), field
 
 
@@ -100,15 +100,15 @@ def _loaded_sheet(
     coat: float,
     pairs: np.ndarray,
     mixing: np.ndarray,
-) -> tuple[GainField, LoadedSheet, Neighbours]:
-    """The gain before any contact, what contacts show, and what is near a single press."""
+) -> tuple[GainField, LoadedSheet, NeighbourTable]:
+    """The gain before any contact, the measurement model, and the neighbours of single presses."""
     loads, light = settings.loads, partial(on_device, dtype=np.dtype(settings.dtype))
-    coarse, fine = discretise(Scene(skin), settings.fidelity), Pixels(_columns(model, settings)).on(model)
+    coarse, fine = discretise(Scene(skin), settings.fidelity), Pixels(_column_count(model, settings)).on(model)
     response = pair_jacobian(model, sigma, fine, jnp.asarray(pairs), jnp.asarray(mixing)).T
     total, covered = (np.asarray(fine.restrict(values)) for values in (sigma, jnp.ones_like(sigma)))
     background = np.divide(total, covered, out=np.zeros_like(total), where=covered > 0)  # 0 beside the sheet
     mean, masks, (points, weights) = (
-        _carried(model, sigma, np.asarray(coarse.centroids, float)),
+        _nearest_values(model, sigma, np.asarray(coarse.centroids, float)),
         pad_masks(skin, fine),
         points_of(coarse, loads.width),
     )
@@ -119,7 +119,7 @@ def _loaded_sheet(
     of_coat = light(_coat_modes(coarse, coat, loads.coat_length))
     sheet = LoadedSheet(
         sheet=reanalysis,
-        neighbours=_neighbours(coarse, centres, settings, half_lengths()),
+        neighbours=_neighbour_table(coarse, centres, settings, edge_half_lengths()),
         sigma=light(mean),
         points=light(points),
         weights=light(weights),
@@ -129,30 +129,34 @@ def _loaded_sheet(
         pixel_modes=light(field.modes_at(centres)),
         pad_area=light((masks.weights * masks.areas).T),
         coat=of_coat,
-        by_coat=reanalysis.slopes_along(light(mean) * of_coat.T, reanalysis.potential),
+        untouched_slopes=reanalysis.slopes_along(light(mean) * of_coat.T, reanalysis.potential),
         law=loads.law,
     )
-    return field, sheet, _neighbours(coarse, centres, _reaching(settings), half_lengths()[:1])  # a press is round
+    return (
+        field,
+        sheet,
+        _neighbour_table(coarse, centres, _press_settings(settings), edge_half_lengths()[:1]),
+    )  # a press is round
 
 
-def _reaching(settings: TrackerSettings) -> TrackerSettings:
+def _press_settings(settings: TrackerSettings) -> TrackerSettings:
     """Settings of the fit of a single press."""
     modes, unknowns, pixels = (
-        int(PRESS_REACH * count) for count in (settings.modes, settings.unknowns, settings.pixels)
+        int(PRESS_REACH_RATIO * count) for count in (settings.modes, settings.unknowns, settings.pixels)
     )
     return replace(settings, modes=modes, unknowns=unknowns, pixels=pixels)
 
 
-def _columns(model: Model, settings: TrackerSettings) -> int:
+def _column_count(model: Model, settings: TrackerSettings) -> int:
     """Pixels along x of the first order. They follow the width of a load, not the sheet: the pixels around a contact
     reach as far on a small skin as on a large one."""
     if settings.columns is not None:
         return settings.columns
     length = float(np.ptp(np.asarray(model.chart, float)[:, 0]))
-    return int(np.clip(np.ceil(length * PIXELS_A_WIDTH / settings.loads.width), *LEAST_MOST_COLUMNS))
+    return int(np.clip(np.ceil(length * PIXELS_PER_WIDTH / settings.loads.width), *COLUMN_LIMITS))
 
 
-def _coat_share(sheet: LoadedSheet, settings: TrackerSettings) -> float:
+def _coat_error(sheet: LoadedSheet, settings: TrackerSettings) -> float:
     """Part of a contact's signal by which an unknown coat makes it err, root mean square of usual loads all over the
     sheet.
 
@@ -161,22 +165,24 @@ def _coat_share(sheet: LoadedSheet, settings: TrackerSettings) -> float:
     """
     pixels = np.asarray(sheet.pixels)
     low, high = pixels.min(0), pixels.max(0)
-    along = (np.arange(COAT_PLACES) + 0.5) / COAT_PLACES
+    along = (np.arange(COAT_GRID) + 0.5) / COAT_GRID
     places = np.stack(np.meshgrid(*(low + (high - low) * along[:, None]).T), -1).reshape(-1, 2)
     usual = np.log([settings.loads.width, settings.loads.force])
-    shares = _coat_shares(sheet, *(on_device(values, pixels.dtype) for values in (places, usual)))
+    shares = _squared_coat_errors(sheet, *(on_device(values, pixels.dtype) for values in (places, usual)))
     return float(np.sqrt(np.mean(shares)))
 
 
 @verb
-def _coat_shares(sheet: LoadedSheet, places: Float[Array, "n 2"], usual: Float[Array, "2"]) -> Float[Array, " n"]:
+def _squared_coat_errors(
+    sheet: LoadedSheet, places: Float[Array, "n 2"], usual: Float[Array, "2"]
+) -> Float[Array, " n"]:
     """Square of that part, of a load of a usual log width and force at each place."""
     gain = jnp.zeros(sheet.modes.shape[1], places.dtype)
 
     def share(place: Float[Array, "2"]) -> Float[Array, ""]:
         contact = jnp.concatenate([place, usual, jnp.zeros_like(place)])[None]
-        near = sheet.near(contact)
-        seen = sheet.shown(contact, gain, jnp.zeros(0, jnp.int32), near).readings
+        near = sheet.neighbourhood(contact)
+        seen = sheet.predict_measurement(contact, gain, jnp.zeros(0, jnp.int32), near).readings
         return jnp.sum(sheet.coat_slopes(contact, gain, near) ** 2) / (seen @ seen)
 
     found: Array = jax.lax.map(share, places)
@@ -186,7 +192,7 @@ def _coat_shares(sheet: LoadedSheet, places: Float[Array, "n 2"], usual: Float[A
 def _coat_modes(model: Model, spread: float, length: float) -> Float[np.ndarray, "elements c"]:
     """Modes of the log conductivity that is not known, of standard deviation ``spread``, on elements; none for zero.
 
-    They are the principal components of the field (Karhunen and Loeve), as many as hold `COAT_VARIANCE` of it.
+    They are the principal components of the field (Karhunen and Loeve), as many as hold `COAT_VARIANCE_SHARE` of it.
     """
     areas = np.sqrt(np.asarray(model.areas, float))
     if not spread:
@@ -194,29 +200,29 @@ def _coat_modes(model: Model, spread: float, length: float) -> Float[np.ndarray,
     modes = field_modes(np.asarray(model.centroids, float), length)
     left, values, _ = np.linalg.svd(areas[:, None] * modes, full_matrices=False)
     share = np.cumsum(values**2) / np.sum(values**2)
-    count = 1 + int(np.searchsorted(share, COAT_VARIANCE))
+    count = 1 + int(np.searchsorted(share, COAT_VARIANCE_SHARE))
     found: np.ndarray = spread * (left * values)[:, :count] / areas[:, None]
     return found
 
 
-def _neighbours(
+def _neighbour_table(
     model: Model, pixels: Float[np.ndarray, "p 2"], settings: TrackerSettings, halves: Float[np.ndarray, "edges 2"]
-) -> Neighbours:
-    """What is nearest to loads of these half lengths."""
+) -> NeighbourTable:
+    """The table of elements, unknowns and pixels nearest to loads of these half lengths."""
     chart = np.asarray(model.chart, float)
     low, high = chart.min(0), chart.max(0)
-    pitch = float((high - low).max() / GRID)
+    pitch = float((high - low).max() / GRID_CELLS)
     shape = tuple(int(n) for n in np.ceil((high - low)[::-1] / pitch).astype(int))
     y, x = np.meshgrid(*(pitch * (np.arange(n) + 0.5) for n in shape), indexing="ij")
     cells = low + np.stack([x.ravel(), y.ravel()], 1)
-    middles, unknowns = chart[np.asarray(model.triangles)].mean(1), _places_of_unknowns(model)
+    middles, unknowns = chart[np.asarray(model.triangles)].mean(1), _unknown_positions(model)
 
     def nearest(places: np.ndarray, count: int) -> Array:
-        squares = squares_to_lines(cells, places, halves)
+        squares = squared_line_distances(cells, places, halves)
         count = min(count, len(places))
         return on_device(np.argpartition(squares, count - 1, -1)[..., :count], np.int32)
 
-    return Neighbours(
+    return NeighbourTable(
         low=on_device(low, settings.dtype),
         pitch=on_device(pitch, settings.dtype),
         elements=nearest(middles, 2 * settings.unknowns),
@@ -226,20 +232,20 @@ def _neighbours(
     )
 
 
-def squares_to_lines(
+def squared_line_distances(
     middles: Float[np.ndarray, "n 2"], places: Float[np.ndarray, "p 2"], halves: Float[np.ndarray, "edges 2"]
 ) -> Float[np.ndarray, "edges n p"]:
     """Squared distances, m^2, of places from straight lines of each half length around each middle."""
     x, y = (places - middles[:, None]).astype(np.float32).transpose(2, 0, 1)
     squares = np.empty((len(halves), *x.shape), np.float32)
     for (a, b), square in zip(halves.astype(np.float32), squares, strict=True):
-        along = np.clip((a * x + b * y) / max(a * a + b * b, np.float32(TINY)), -1, 1)
+        along = np.clip((a * x + b * y) / max(a * a + b * b, np.float32(MIN_SQUARED_LENGTH)), -1, 1)
         square[:] = (x - a * along) ** 2 + (y - b * along) ** 2
     return squares
 
 
-def _places_of_unknowns(model: Model) -> Float[np.ndarray, "n 2"]:
-    """About where each unknown lies: the mean middle of its elements."""
+def _unknown_positions(model: Model) -> Float[np.ndarray, "n 2"]:
+    """Approximate position of each unknown: the mean middle of its elements."""
     dofs = np.asarray(model.system.dofs)
     middles = np.asarray(model.chart, float)[np.asarray(model.triangles)].mean(1)
     count = np.maximum(np.bincount(dofs.ravel(), minlength=model.system.unknowns), 1)
@@ -247,17 +253,17 @@ def _places_of_unknowns(model: Model) -> Float[np.ndarray, "n 2"]:
     return np.stack(sums, 1) / count[:, None]
 
 
-def with_errors(sheet: LoadedSheet, model: Model, errors: Float[np.ndarray, "elements c"]) -> LoadedSheet:
+def with_sheet_errors(sheet: LoadedSheet, model: Model, errors: Float[np.ndarray, "elements c"]) -> LoadedSheet:
     """The sheet with modes of its error, which are those on the elements of the model, in place of a coat's."""
-    coat = on_device(_carried(model, errors, np.asarray(sheet.points, float).mean(1)), sheet.sigma.dtype)
-    by_coat = sheet.sheet.slopes_along(sheet.sigma * coat.T, sheet.sheet.potential)
-    return replace(sheet, coat=coat, by_coat=by_coat)
+    coat = on_device(_nearest_values(model, errors, np.asarray(sheet.points, float).mean(1)), sheet.sigma.dtype)
+    untouched_slopes = sheet.sheet.slopes_along(sheet.sigma * coat.T, sheet.sheet.potential)
+    return replace(sheet, coat=coat, untouched_slopes=untouched_slopes)
 
 
-def _carried(
+def _nearest_values(
     model: Model, values: Float[ArrayLike, "elements ..."], places: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n ..."]:
-    """Values of elements at places: of the nearest element."""
+    """Values at places, each that of the nearest element."""
     near = cKDTree(np.asarray(model.centroids, float)).query(places)[1]
     found: np.ndarray = np.asarray(values, float)[near]
     return found

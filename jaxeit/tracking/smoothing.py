@@ -1,6 +1,6 @@
-"""Contacts of a recording, each frame told by the frames after it as well as by those before.
+"""Contacts of a recording, each frame smoothed by the frames after it as well as by those before.
 
-A smoother of Rauch, Tung and Striebel (1965, AIAA J. 3) for the numbers of one contact, from birth to death: with the
+A smoother of Rauch, Tung and Striebel (1965, AIAA J. 3) for the state of one contact, from birth to death: with the
 filter's mean m and covariance P of a frame, and the transition F, Q to the next one,
 
     p = F m,   S = F P F^T + Q,   G = P F^T S^-1,
@@ -24,66 +24,66 @@ import numpy as np
 from jaxtyping import Float
 
 from .belief.consider import ConsiderErrors
-from .belief.filter import CONTACT_SIZE, Belief, numbers_of, predicted
+from .belief.filter import CONTACT_SIZE, Belief, contact_slice, predict
 from .tracker import Tracker
 from .tracks import Track, Tracking, track_of
 
-# Frames after a frame that tell of it; a contact's velocity forgets them sooner.
-LAG = 256
-# A covariance above the prediction's by this factor is no rounding.
-JUMPED = 1 + 1e-6
+# Number of later frames that smooth a frame; a contact's velocity forgets them sooner.
+DEFAULT_LAG = 256
+# Covariance over that of the prediction above which a contact has jumped; less is rounding.
+JUMP_RATIO = 1 + 1e-6
 
 
 class Transition(NamedTuple):
-    """From the numbers of a contact in one frame to those in the next: matrix (8, 8) and covariance of the walk."""
+    """From the state of a contact in one frame to that in the next: matrix (8, 8) and covariance of the walk."""
 
     matrix: Float[np.ndarray, "8 8"]
     walk: Float[np.ndarray, "8 8"]
 
 
 class State(NamedTuple):
-    """Numbers of one contact in a frame: mean (8,) and covariance (8, 8), in the order of `Belief`."""
+    """State of one contact in a frame: mean (8,) and covariance (8, 8), in the order of `Belief`."""
 
     mean: Float[np.ndarray, "8"]
     covariance: Float[np.ndarray, "8 8"]
 
 
-def transition(tracker: Tracker, seconds: float) -> Transition:
-    """How the filter predicts a contact so many seconds later."""
+def transition_after(tracker: Tracker, seconds: float) -> Transition:
+    """The transition by which the filter predicts a contact so many seconds later."""
     dtype = tracker.filter.places.dtype
     unit, none = jnp.eye(CONTACT_SIZE, dtype=dtype), partial(jnp.zeros, dtype=dtype)
     numbers = Belief(unit, none(1), none((CONTACT_SIZE**2 + 1,) * 2), level=none(2).at[1].set(1))
-    found = predicted(tracker.filter, numbers, jnp.asarray(seconds))
+    found = predict(tracker.filter, numbers, jnp.asarray(seconds))
     return Transition(np.asarray(found.contacts).T, np.asarray(found.covariance)[:CONTACT_SIZE, :CONTACT_SIZE])
 
 
-def smoothed(states: Sequence[State], steps: Sequence[Transition]) -> list[State]:
-    """The states of a contact in consecutive frames, given all of them.
+def smooth(states: Sequence[State], steps: Sequence[Transition]) -> list[State]:
+    """Smooth the states of a contact in consecutive frames.
 
     Args:
         states: of the filter.
         steps: from each frame to the next one, one fewer than states.
     """
     found = list(states[-1:])
-    for state, step, after in zip(states[-2::-1], steps[::-1], states[:0:-1], strict=True):
-        found.append(_one_back(state, step, after, found[-1]))
+    for state, step, next_filtered in zip(states[-2::-1], steps[::-1], states[:0:-1], strict=True):
+        found.append(_smooth_step(state, step, next_filtered, found[-1]))
     return found[::-1]
 
 
-def _one_back(state: State, step: Transition, after: State, told: State) -> State:
-    """A state, given the next one by the filter and by all frames."""
+def _smooth_step(state: State, step: Transition, next_filtered: State, next_smoothed: State) -> State:
+    """Smooth a state, given the next one as filtered and as smoothed."""
     matrix, walk = step
-    ahead = matrix @ state.covariance @ matrix.T + walk
+    predicted = matrix @ state.covariance @ matrix.T + walk
     # Units differ: metres beside logarithms.
-    scale = np.sqrt(np.diag(ahead))
-    root = np.linalg.cholesky(ahead / np.outer(scale, scale))
-    white = np.linalg.solve(root, np.linalg.solve(root, after.covariance / np.outer(scale, scale)).T)
-    if np.linalg.eigvalsh(0.5 * (white + white.T))[-1] > JUMPED:
+    scale = np.sqrt(np.diag(predicted))
+    root = np.linalg.cholesky(predicted / np.outer(scale, scale))
+    whitened = np.linalg.solve(root, np.linalg.solve(root, next_filtered.covariance / np.outer(scale, scale)).T)
+    if np.linalg.eigvalsh(0.5 * (whitened + whitened.T))[-1] > JUMP_RATIO:
         return state
-    gain = np.linalg.solve(ahead / np.outer(scale, scale), (matrix @ state.covariance) / scale[:, None]).T / scale
-    kept = np.eye(CONTACT_SIZE) - gain @ matrix
-    covariance = kept @ state.covariance @ kept.T + gain @ (walk + told.covariance) @ gain.T
-    return State(state.mean + gain @ (told.mean - matrix @ state.mean), 0.5 * (covariance + covariance.T))
+    gain = np.linalg.solve(predicted / np.outer(scale, scale), (matrix @ state.covariance) / scale[:, None]).T / scale
+    reduction = np.eye(CONTACT_SIZE) - gain @ matrix
+    covariance = reduction @ state.covariance @ reduction.T + gain @ (walk + next_smoothed.covariance) @ gain.T
+    return State(state.mean + gain @ (next_smoothed.mean - matrix @ state.mean), 0.5 * (covariance + covariance.T))
 
 
 class TimedTracks(NamedTuple):
@@ -95,7 +95,7 @@ class TimedTracks(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """What the filter knew after a frame: time (ns), states and edges by number, and seconds since the last frame."""
+    """Filtered contacts after a frame: time (ns), states and edges by number, and seconds since the last frame."""
 
     time: int
     states: dict[int, State]
@@ -103,8 +103,8 @@ class _Frame:
     considered: ConsiderErrors
     seconds: float
 
-    def timed(self, states: dict[int, State]) -> TimedTracks:
-        whole = {n: self.considered.added(n, state.covariance) for n, state in states.items()}
+    def timed_tracks(self, states: dict[int, State]) -> TimedTracks:
+        whole = {n: self.considered.add_to(n, state.covariance) for n, state in states.items()}
         tracks = (track_of(n, states[n].mean, whole[n], edge) for n, edge in self.edges.items())
         return TimedTracks(self.time, tuple(tracks))
 
@@ -115,7 +115,7 @@ class Smoother:
     The numbers of contacts, and which of them are edges, are those of the filter.
 
     Args:
-        lag: number of frames, default `LAG`.
+        lag: number of frames, default `DEFAULT_LAG`.
 
     Example:
         smoother, now = tracking.Smoother(tracker), tracker.start()
@@ -127,36 +127,37 @@ class Smoother:
             print(time, tracks)  # of the last frames
     """
 
-    def __init__(self, tracker: Tracker, lag: int = LAG):
+    def __init__(self, tracker: Tracker, lag: int = DEFAULT_LAG):
         self._lag = lag
         self._frames: deque[_Frame] = deque()
-        self._transition = lru_cache(maxsize=4 * lag)(partial(transition, tracker))
+        self._transition = lru_cache(maxsize=4 * lag)(partial(transition_after, tracker))
 
     def add(self, time: int, now: Tracking, seconds: float) -> Iterator[TimedTracks]:
         """Take what is known after a frame at a time (ns), so many seconds after the last one; and give back what is
         settled."""
         contacts, covariance = np.asarray(now.belief.contacts), np.asarray(now.belief.covariance)
         states = {
-            number: State(contacts[k], covariance[numbers_of(k), numbers_of(k)]) for k, number in enumerate(now.numbers)
+            number: State(contacts[k], covariance[contact_slice(k), contact_slice(k)])
+            for k, number in enumerate(now.numbers)
         }
         edges = dict(zip(now.numbers, now.edges, strict=True))
         self._frames.append(_Frame(time, states, edges, now.considered, seconds))
         if len(self._frames) > 2 * self._lag:
-            yield from self._settled(self._lag)
+            yield from self._smooth_oldest(self._lag)
 
     def end(self) -> Iterator[TimedTracks]:
         """Give back the frames that are left."""
-        yield from self._settled(len(self._frames))
+        yield from self._smooth_oldest(len(self._frames))
 
-    def _settled(self, count: int) -> Iterator[TimedTracks]:
-        """Smooth all frames at hand, and give back the first of them."""
+    def _smooth_oldest(self, count: int) -> Iterator[TimedTracks]:
+        """Smooth all frames at hand, and give back the oldest of them."""
         found: list[dict[int, State]] = [{} for _ in self._frames]
         for number in dict.fromkeys(number for frame in self._frames for number in frame.states):
-            lived = [at for at, frame in enumerate(self._frames) if number in frame.states]
-            own = [self._frames[at] for at in lived]
-            steps = [self._transition(frame.seconds) for frame in own[1:]]
-            states = smoothed([frame.states[number] for frame in own], steps)
-            for at, state in zip(lived, states, strict=True):
+            rows = [at for at, frame in enumerate(self._frames) if number in frame.states]
+            frames = [self._frames[at] for at in rows]
+            steps = [self._transition(frame.seconds) for frame in frames[1:]]
+            states = smooth([frame.states[number] for frame in frames], steps)
+            for at, state in zip(rows, states, strict=True):
                 found[at][number] = state
-        for settled in found[:count]:
-            yield self._frames.popleft().timed(settled)
+        for smoothed in found[:count]:
+            yield self._frames.popleft().timed_tracks(smoothed)

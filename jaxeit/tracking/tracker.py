@@ -20,39 +20,39 @@ from ..kinds import require_unmasked
 from ..model.discretisation import Model, require_model
 from ..skin.description import Skin
 from .belief.consider import ConsiderErrors
-from .belief.filter import CONTACT_SIZE, MIN_TOLD_SHARE, SEEN_SIZE, Belief, ContactFilter, Pads, Update
+from .belief.filter import CONTACT_SIZE, LOAD_SIZE, MIN_PAD_SHARE, Belief, ContactFilter, Pads, Update
 from .belief.layer import GainField, LearnedLayer
 from .belief.programs import Programs
 from .events import Events
 from .looks import (
-    begun,
-    calmer,
-    caught_up,
-    has_ended,
-    is_doubted,
+    advance_look,
+    apply_update,
+    begin_look,
+    begin_recount,
+    catch_up,
+    extend_patience,
+    has_converged,
     is_finite,
-    is_given_up,
-    looked,
-    meanwhile,
-    recounted,
-    settled,
-    without_contacts,
+    is_overdue,
+    needs_recount,
+    queue_frame,
+    remove_contacts,
 )
 from .preparation import prepare_filter
 from .settings import TrackerSettings
-from .tracks import Backlog, Look, Seen, Track, Tracking
+from .tracks import Backlog, Look, Observation, Track, Tracking
 
-# A frame is expected if what is left of it is below this many of its standard deviations above its mean, and no number
-# of the belief changes by much more than it may.
-UNEXPECTED, SURPRISING = 4.0, 25.0
-# Prior standard deviations beyond which no mode of the gain is believed: what contacts told of the gain was wrong then.
-MOST_GAIN = 4.0
-# A frame that no event explains is asked about again after `Tracking.patience`, or where it is so much worse.
-WORSE = 1.3
-# Part of the signal of contacts that a frame may be off, for contacts that moved on while frames waited for too long.
-UNSEEN = 0.01
-# Of the half length of an edge, the middles of nine equal parts.
-ALONG = (np.arange(9) - 4) / 4.5
+# A frame is expected if its misfit is below this many of its standard deviations above its mean, and if the correction
+# of the belief is below this squared Mahalanobis length.
+MAX_MISFIT_SCORE, MAX_CORRECTION_SQUARE = 4.0, 25.0
+# Largest mode of the gain, in prior standard deviations: beyond it, what contacts told of the gain was wrong.
+MAX_GAIN = 4.0
+# A frame that no event explains is looked into again after `Tracking.patience`, or if the misfit grows by this factor.
+MISFIT_GROWTH = 1.3
+# Largest misfit over the squared signal of contacts, with which contacts that moved while frames waited are kept.
+MAX_MISFIT_SHARE = 0.01
+# Middles of nine equal parts of an edge, over its half length.
+LINE_FRACTIONS = (np.arange(9) - 4) / 4.5
 
 
 class Tracker:
@@ -69,14 +69,14 @@ class Tracker:
         self, tracker: ContactFilter, presses: ContactFilter, settings: TrackerSettings, area: float, field: GainField
     ):
         """`presses`: the filter of single presses, which reaches farther; `area`: of the skin, m^2."""
-        self.filter, self.of_presses, self.events, self.field = tracker, presses, Events(settings, area), field
+        self.filter, self.press_filter, self.events, self.field = tracker, presses, Events(settings, area), field
         self.area = area
         self._settings, self.programs = settings, Programs(tracker)
 
     @cached_property
     def press_programs(self) -> Programs:
         """The programs of single presses."""
-        return Programs(self.of_presses)
+        return Programs(self.press_filter)
 
     @property
     def settings(self) -> TrackerSettings:
@@ -95,9 +95,9 @@ class Tracker:
         layer = LearnedLayer.unknown(self.field) if layer is None else layer
         self.field.require_same(layer.field)
         layer = replace(layer, field=self.field)  # what errors of sheet and mesh look like is known of this tracker
-        return Tracking(self._untouched(layer), layer)
+        return Tracking(self._initial_belief(layer), layer)
 
-    def _untouched(self, layer: LearnedLayer) -> Belief:
+    def _initial_belief(self, layer: LearnedLayer) -> Belief:
         """The belief without contacts; its gain is that under the next press."""
         put, covariance = partial(jnp.asarray, dtype=self.filter.places.dtype), layer.before_press
         level = np.array([layer.mean[0], covariance[0, 0]])
@@ -108,22 +108,22 @@ class Tracker:
         if now.begun == now.taught:
             return now.layer
         found = now.layer.told(now.belief.gain, now.belief.covariance, now.begun - now.taught)
-        return found if (np.abs(found.mean) <= MOST_GAIN).all() else found.restarted()
+        return found if (np.abs(found.mean) <= MAX_GAIN).all() else found.restarted()
 
-    def _taught(self, now: Tracking) -> Tracking:
-        """With what contacts have taught, once all of them have lifted: the next press has an effect of its own."""
+    def _learn_after_lift(self, now: Tracking) -> Tracking:
+        """Learn the gain of the layer once all contacts have lifted: the next press has an effect of its own."""
         if now.numbers or now.backlog is not None or now.begun == now.taught:
             return now
         layer = self.learned(now)
-        return replace(now, belief=self._untouched(layer), layer=layer, taught=now.begun)
+        return replace(now, belief=self._initial_belief(layer), layer=layer, taught=now.begun)
 
     def told_by_pads(
         self, tracks: tuple[Track, ...], pad_errors: Float[ArrayLike, " pads"] | None = None
     ) -> Bool[np.ndarray, " n"]:
-        """Of which contacts pads tell the force, (n,): pads whose force is known bear `MIN_TOLD_SHARE` of it or more.
+        """Of which contacts pads tell the force, (n,): pads whose force is known bear `MIN_PAD_SHARE` of it or more.
 
-        The same rule is part of each step of the filter (`telling_pads`); here it is computed in NumPy, as tracks are
-        any number and JAX would compile a program for each.
+        The same rule is part of each step of the filter (`informative_pads`); here it is computed in NumPy, as tracks
+        are any number and JAX would compile a program for each.
 
         Args:
             pad_errors: as for `step`; not finite for a pad that tells no force.
@@ -132,12 +132,12 @@ class Tracker:
             return np.zeros(len(tracks), bool)
         sheet, known = self.filter.sheet, np.isfinite(np.asarray(pad_errors, float))
         area, pixels = np.asarray(sheet.pad_area)[:, known].sum(1), np.asarray(sheet.pixels)
-        rows = np.array([one.position + np.multiply.outer(ALONG, one.half) for one in tracks])
+        rows = np.array([one.position + np.multiply.outer(LINE_FRACTIONS, one.half) for one in tracks])
         width = np.array([one.width for one in tracks])[:, None]
         width = np.maximum(width, np.sqrt(self.area / len(pixels)))  # narrower loads would fall between pixels
         square = ((rows[:, :, None] - pixels) ** 2).sum(-1)
         load = np.exp(-0.5 * square / width[..., None] ** 2).mean(1) / (2 * np.pi * width**2)
-        return np.asarray(load @ area >= MIN_TOLD_SHARE)
+        return np.asarray(load @ area >= MIN_PAD_SHARE)
 
     def step(
         self,
@@ -164,8 +164,8 @@ class Tracker:
         """
         if not 0 < seconds < np.inf:
             raise InverseError(f"seconds is {seconds}; give the time since the last frame, above zero")
-        seen = Seen(self.frame(dv), self.pads(pad_forces, pad_errors), seconds)
-        return self._with_considered(self._taught(bounded(self._stepped(now, seen, whole))), seen.pads)
+        observation = Observation(self.frame(dv), self.pads(pad_forces, pad_errors), seconds)
+        return self._completed(self._step(now, observation, whole), observation.pads)
 
     def press(
         self,
@@ -196,7 +196,7 @@ class Tracker:
         if not is_finite(update):
             return now
         found = replace(now, belief=update.belief, misfit=float(update.misfit), begun=1)
-        return bounded(replace(found, numbers=(1,), edges=(False,), faint=(0,)))
+        return bound_gain(replace(found, numbers=(1,), edges=(False,), faint=(0,)))
 
     def press_update(self, before: Belief, frame: Float[np.ndarray, " readings"], pads: Pads) -> Update:
         """The belief after a frame in which one contact presses, from a belief without contacts.
@@ -205,85 +205,89 @@ class Tracker:
         other places are tried until the contact explains the frame, and the most probable contact counts.
         """
         found: list[Update] = []
-        for place in self.programs.explaining_places(self.programs.unexplained(before, frame, pads)):
-            found.append(self.press_programs.careful(self.events.with_contact(before, place), frame, pads))
-            if has_ended(found[-1]) and not self._is_far(found[-1]):
+        for place in self.programs.matched_positions(self.programs.innovation(before, frame, pads)):
+            found.append(self.press_programs.single_frame_update(self.events.with_contact(before, place), frame, pads))
+            if has_converged(found[-1]) and not self._is_misfit(found[-1]):
                 break
         return max(found, key=lambda update: np.nan_to_num(float(update.evidence), nan=-np.inf))
 
-    def _stepped(self, now: Tracking, seen: Seen, whole: bool) -> Tracking:
-        if now.backlog is not None and is_given_up(now.backlog):
-            now = self._given_up(now, seen)
+    def _step(self, now: Tracking, observation: Observation, whole: bool) -> Tracking:
+        if now.backlog is not None and is_overdue(now.backlog):
+            now = self._abandon_backlog(now, observation)
         elif now.backlog is not None:
-            now, seen = caught_up(now, now.backlog, seen)
+            now, observation = catch_up(now, now.backlog, observation)
         if now.backlog is not None:
-            moved, update = self.programs.followed(now.belief, *seen)
-            # What the contacts do not explain would bend them: until it is explained they move on as they did.
-            after = replace(now, belief=moved) if self._is_far(update) else settled(now, update)
-            return replace(after, backlog=meanwhile(now.backlog, seen))
-        after, look = self._followed(now, seen)
+            predicted, update = self.programs.predict_and_update(now.belief, *observation)
+            # An unexplained innovation would bend the contacts: until it is explained they are only predicted.
+            after = replace(now, belief=predicted) if self._is_misfit(update) else apply_update(now, update)
+            return replace(after, backlog=queue_frame(now.backlog, observation))
+        after, look = self._follow(now, observation)
         if look is None:
             return after
         now = replace(look.before, backlog=Backlog(after, look))
         while whole and now.backlog is not None:
-            now = self._looked(now, now.backlog)
+            now = self._advance_look(now, now.backlog)
         return now
 
-    def _given_up(self, now: Tracking, seen: Seen) -> Tracking:
-        """Without the frames that wait, and without contacts that have moved on unseen and do not explain the frame."""
-        _, update = self.programs.followed(now.belief, *seen)
-        signal = float(np.sum(np.square(np.asarray(update.loudness))))
-        if is_finite(update) and float(update.misfit) - self.programs.size < UNSEEN * signal:
-            return replace(calmer(now), backlog=None, since=0, misfit=float(update.misfit))
-        return replace(without_contacts(now), backlog=None)
+    def _abandon_backlog(self, now: Tracking, observation: Observation) -> Tracking:
+        """Drop the frames that wait, and contacts that have moved on meanwhile and do not explain the frame."""
+        _, update = self.programs.predict_and_update(now.belief, *observation)
+        signal = float(np.sum(np.square(np.asarray(update.signal_to_noise))))
+        if is_finite(update) and float(update.misfit) - self.programs.size < MAX_MISFIT_SHARE * signal:
+            return replace(extend_patience(now), backlog=None, since=0, misfit=float(update.misfit))
+        return replace(remove_contacts(now), backlog=None)
 
     def look(self, now: Tracking) -> Tracking:
         """A piece more of what is left to be explained, if anything is: `Tracking.backlog`.
 
-        A piece is at most `filter.STEPS` evaluations of what contacts show, as an ordinary frame, and mostly two.
+        A piece is at most `filter.MAX_STEPS` evaluations of what contacts show, as an ordinary frame, and mostly two.
         """
         backlog = now.backlog
         if backlog is None:
             return now
-        last = backlog.waiting[-1] if backlog.look is None or backlog.waiting else backlog.look.seen
-        return self._with_considered(self._taught(bounded(self._looked(now, backlog))), last.pads)
+        last = backlog.waiting[-1] if backlog.look is None or backlog.waiting else backlog.look.observation
+        return self._completed(self._advance_look(now, backlog), last.pads)
 
-    def _with_considered(self, now: Tracking, pads: Pads) -> Tracking:
-        """With what unknown shapes and an unknown coat make the contacts err by."""
+    def _completed(self, now: Tracking, pads: Pads) -> Tracking:
+        """What is known after a frame, with the gain bounded and learned, and with consider errors."""
+        return self._with_consider_errors(self._learn_after_lift(bound_gain(now)), pads)
+
+    def _with_consider_errors(self, now: Tracking, pads: Pads) -> Tracking:
+        """Add errors of contacts by unknown shapes, an unknown coat and errors of the model."""
         contacts = np.asarray(now.belief.contacts)
-        if not now.numbers or now.considered.holds(now.numbers, contacts):
+        if not now.numbers or now.considered.is_valid_for(now.numbers, contacts):
             return now
         covariance = self.programs.consider_covariance(now.belief, pads, now.layer.unexplained)
-        return replace(now, considered=ConsiderErrors(now.numbers, contacts[:, :SEEN_SIZE], covariance))
+        return replace(now, considered=ConsiderErrors(now.numbers, contacts[:, :LOAD_SIZE], covariance))
 
-    def _looked(self, now: Tracking, backlog: Backlog) -> Tracking:
+    def _advance_look(self, now: Tracking, backlog: Backlog) -> Tracking:
         before, look, waiting = backlog.before, backlog.look, backlog.waiting
         if look is not None:
-            otherwise, look = look.otherwise, looked(look, self.programs, self.events)
-            if look.otherwise is not otherwise:  # something has happened
-                now = self._until_now(look.otherwise, waiting)
+            uneventful, look = look.uneventful, advance_look(look, self.programs, self.events)
+            if look.uneventful is not uneventful:  # something has happened
+                now = self._predict_to_now(look.uneventful, waiting)
             if look.after is not None:
                 before, look = look.after, None
         else:
-            (before, look), waiting = self._followed(before, waiting[0]), waiting[1:]
+            (before, look), waiting = self._follow(before, waiting[0]), waiting[1:]
         return before if look is None and not waiting else replace(now, backlog=Backlog(before, look, waiting))
 
-    def _followed(self, now: Tracking, seen: Seen) -> tuple[Tracking, Look | None]:
-        """The contacts after a frame in which nothing happens, and the look into it if it is not expected."""
-        moved, update = self.programs.followed(now.belief, *seen)
-        after = settled(now, update)
+    def _follow(self, now: Tracking, observation: Observation) -> tuple[Tracking, Look | None]:
+        """The contacts after a frame in which nothing happens, and the look into it if it is unexpected."""
+        predicted, update = self.programs.predict_and_update(now.belief, *observation)
+        after = apply_update(now, update)
         unexpected = self._is_unexpected(now, update)
-        if not is_finite(update) or not (unexpected or is_doubted(now)):
+        if not is_finite(update) or not (unexpected or needs_recount(now)):
             return replace(after, since=now.since + 1), None
-        before, after = replace(now, belief=moved), replace(after, since=0, misfit=float(update.misfit))
+        before, after = replace(now, belief=predicted), replace(after, since=0, misfit=float(update.misfit))
         if unexpected:
-            return after, begun(before, after, seen, unfinished=not bool(update.converged))
-        return after, recounted(before, after, seen, self.programs, self.events)
+            return after, begin_look(before, after, observation, unconverged=not bool(update.converged))
+        return after, begin_recount(before, after, observation, self.programs, self.events)
 
-    def _until_now(self, after: Tracking, waiting: tuple[Seen, ...]) -> Tracking:
-        """What is believed while frames wait: the contacts after the last event have moved on."""
-        seconds = sum(seen.seconds for seen in waiting)
-        return replace(after, belief=self.programs.predicted(after.belief, seconds)) if waiting else after
+    def _predict_to_now(self, after: Tracking, waiting: tuple[Observation, ...]) -> Tracking:
+        """Predict the contacts after the last event over the frames that wait."""
+        seconds = sum(observation.seconds for observation in waiting)
+        return replace(after, belief=self.programs.predict(after.belief, seconds)) if waiting else after
 
     def frame(self, dv: Float[ArrayLike, " readings"]) -> Float[np.ndarray, " readings"]:
         """A frame as the programs take it; raises InverseError if it has another shape."""
@@ -310,19 +314,20 @@ class Tracker:
         return Pads(np.where(known, force, 0), np.where(known, error, np.inf))
 
     def _is_unexpected(self, now: Tracking, update: Update) -> bool:
-        if float(update.surprise) >= SURPRISING:
+        if float(update.correction_square) >= MAX_CORRECTION_SQUARE:
             return True
-        return self._is_far(update) and (now.since >= now.patience or float(update.misfit) > WORSE * now.misfit)
+        grown = float(update.misfit) > MISFIT_GROWTH * now.misfit
+        return self._is_misfit(update) and (now.since >= now.patience or grown)
 
-    def _is_far(self, update: Update) -> bool:
+    def _is_misfit(self, update: Update) -> bool:
         size = self.programs.size
-        return float(update.misfit) > size + UNEXPECTED * float(np.sqrt(2 * size))
+        return float(update.misfit) > size + MAX_MISFIT_SCORE * float(np.sqrt(2 * size))
 
 
-def bounded(now: Tracking) -> Tracking:
-    """Without what this press told of the gain, if a mode is beyond `MOST_GAIN`; the contacts stay."""
+def bound_gain(now: Tracking) -> Tracking:
+    """Reset the gain to that before this press if a mode is beyond `MAX_GAIN`; the contacts stay."""
     gain, layer = np.asarray(now.belief.gain), now.layer
-    if (np.abs(gain) <= MOST_GAIN * np.sqrt(1 + layer.press_variance)).all():
+    if (np.abs(gain) <= MAX_GAIN * np.sqrt(1 + layer.press_variance)).all():
         return now
     covariance = np.array(now.belief.covariance)
     own = now.belief.contacts.size

@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from .belief.consider import ConsiderErrors
-from .belief.filter import Attempt, Belief, Pads, numbers_of
+from .belief.filter import Attempt, Belief, Pads, contact_slice
 from .belief.layer import LearnedLayer
 from .events import Hypothesis
 
-# Frames after which a frame that no event explains is asked about again: twice as many each time that nothing is found,
-# as where the model of a held contact errs by more than was stated, and no more than so many.
-PATIENCE, MOST_PATIENCE = 10, 80
+# Number of frames after which a frame that no event explains is looked into again: twice as many each time that nothing
+# is found, as where the model of a held contact errs by more than was stated; and the largest such number.
+PATIENCE, MAX_PATIENCE = 10, 80
 
 
 class Track(NamedTuple):
@@ -77,26 +77,26 @@ class Tracking:
     def tracks(self) -> tuple[Track, ...]:
         """The contacts, in the order in which they began."""
         contacts, covariance = np.asarray(self.belief.contacts), np.asarray(self.belief.covariance)
-        blocks = [covariance[own, own] for own in map(numbers_of, range(len(contacts)))]
+        blocks = [covariance[own, own] for own in map(contact_slice, range(len(contacts)))]
         return tuple(
-            track_of(number, contacts[k], self.considered.added(number, blocks[k]), edge)
+            track_of(number, contacts[k], self.considered.add_to(number, blocks[k]), edge)
             for k, (number, edge) in enumerate(zip(self.numbers, self.edges, strict=True))
         )
 
-    def under(self, event: Hypothesis, belief: Belief) -> "Tracking":
+    def under(self, hypothesis: Hypothesis, belief: Belief) -> "Tracking":
         """After an event, with what is believed then."""
         faint = dict(zip(self.numbers, self.faint, strict=True))
         return replace(
             self,
             belief=belief,
-            numbers=event.numbers,
-            edges=event.edges,
-            faint=tuple(faint.get(number, 0) for number in event.numbers),
-            begun=max([self.begun, *event.numbers]),
+            numbers=hypothesis.numbers,
+            edges=hypothesis.edges,
+            faint=tuple(faint.get(number, 0) for number in hypothesis.numbers),
+            begun=max([self.begun, *hypothesis.numbers]),
         )
 
 
-class Seen(NamedTuple):
+class Observation(NamedTuple):
     """A frame (readings,) V, the forces on the pads, and the seconds since the frame before."""
 
     dv: np.ndarray
@@ -104,33 +104,33 @@ class Seen(NamedTuple):
     seconds: float
 
 
-# An update is given up after so many evaluations if as many more steps like the next one would not make it the best.
-PROMISING, OUTLOOK = 2, 3
+# Evaluations after which a trial may be given up: if so many more steps like the next one would not make it the best.
+MIN_TRIAL_STEPS, FORECAST_STEPS = 2, 3
 
 
 class Trial(NamedTuple):
-    """Contacts before a frame as an event leaves them, and how far the update by this frame has come."""
+    """The hypothesis of an event before a frame, and the update by this frame as far as it has come."""
 
-    event: Hypothesis
+    hypothesis: Hypothesis
     attempt: Attempt | None = None
 
     @property
     def ended(self) -> bool:
-        """Whether the update has come to its end."""
+        """Whether the update has ended."""
         return self.attempt is not None and bool(self.attempt.ended)
 
     @property
-    def probability(self) -> float:
-        """Log of the probability of event and frame, up to a constant; of an update that is not finite, none."""
+    def log_probability(self) -> float:
+        """Log of the probability of event and frame, up to a constant; -inf for an update that is not finite."""
         assert self.attempt is not None
         evidence = float(self.attempt.evidence)
-        return evidence + self.event.prior if math.isfinite(evidence) else -math.inf
+        return evidence + self.hypothesis.prior if math.isfinite(evidence) else -math.inf
 
     def is_hopeless(self, best: float) -> bool:
-        """Whether the update would be less probable than another also after steps that do as much as the next one."""
-        if self.attempt is None or self.attempt.state is None or int(self.attempt.state.steps) < PROMISING:
+        """Whether the update would stay less probable than another after more steps that do as much as the next one."""
+        if self.attempt is None or self.attempt.state is None or int(self.attempt.state.steps) < MIN_TRIAL_STEPS:
             return False
-        return self.probability + OUTLOOK * float(self.attempt.state.promised) < best
+        return self.log_probability + FORECAST_STEPS * float(self.attempt.state.promised) < best
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,22 +139,22 @@ class Look:
 
     | meaning                                                                             |
     |-------------------------------------------------------------------------------------|
-    | seen: the frame                                                                     |
+    | observation: the frame                                                              |
     | before: contacts before it, after the events that have been found                   |
-    | otherwise: contacts after it if nothing more has happened                           |
-    | unfinished: whether `otherwise` is from an update that had not converged            |
-    | best: the contacts before it                                                        |
+    | uneventful: contacts after it if nothing more has happened                          |
+    | best: the trial of the contacts before it                                           |
     | events: number of events that are still looked for                                  |
-    | trials: what else may have happened; None: not asked yet                            |
+    | unconverged: whether `uneventful` is from an update that had not converged          |
+    | trials: of the events that may have happened; None: not begun                       |
     | after: contacts after the frame; None: not yet known                                |
     """
 
-    seen: Seen
+    observation: Observation
     before: Tracking
-    otherwise: Tracking
+    uneventful: Tracking
     best: Trial
     events: int
-    unfinished: bool = False
+    unconverged: bool = False
     trials: tuple[Trial, ...] | None = None
     after: Tracking | None = None
 
@@ -172,11 +172,11 @@ class Backlog:
 
     before: Tracking
     look: Look | None
-    waiting: tuple[Seen, ...] = ()
+    waiting: tuple[Observation, ...] = ()
 
 
 def track_of(number: int, row: np.ndarray, covariance: np.ndarray, edge: bool) -> Track:
-    """A contact from its numbers (8,) and their covariance (8, 8)."""
+    """A contact from its state (8,) and the covariance of that (8, 8)."""
     return Track(
         number=number,
         position=row[:2],

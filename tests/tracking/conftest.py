@@ -62,8 +62,8 @@ def load(x, y, force, width=0.012):
 def with_filter(tracker, **settings):
     """The tracker whose filters hold other numbers."""
     given = {name: jnp.asarray(value) for name, value in settings.items()}
-    of_frames, of_presses = (replace(one, **given) for one in (tracker.filter, tracker.of_presses))
-    return Tracker(of_frames, of_presses, tracker.settings, tracker.area, tracker.field)
+    of_frames, press_filter = (replace(one, **given) for one in (tracker.filter, tracker.press_filter))
+    return Tracker(of_frames, press_filter, tracker.settings, tracker.area, tracker.field)
 
 
 def in_double_precision(tree):

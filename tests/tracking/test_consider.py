@@ -13,7 +13,7 @@ from jaxeit.contacts.loads.pressure import Form, line_shapes, shape_directions
 from jaxeit.model.gaussian_field import field_modes
 from jaxeit.tracking import prepare_tracker
 from jaxeit.tracking.belief.consider import ConsiderErrors
-from jaxeit.tracking.belief.response import SHORTEST, load_pressure
+from jaxeit.tracking.belief.response import MIN_HALF_LENGTH, load_pressure
 from tests.compiled import compiled
 
 from .conftest import SECONDS, SETTINGS, load
@@ -26,7 +26,7 @@ def test_moments_of_a_round_load_are_those_of_single_frames():
     """And they change neither force nor place."""
     one = jnp.array(load(0.1, 0.1, 5.0))
     points = jnp.stack(jnp.meshgrid(jnp.linspace(0, 0.2, 81), jnp.linspace(0, 0.2, 81)), -1)
-    found = line_shapes(one, points, SHORTEST)
+    found = line_shapes(one, points, MIN_HALF_LENGTH)
     wanted = shape_directions(one[None], jnp.array([Form.ROUND]), points)
     np.testing.assert_allclose(found, wanted, atol=1e-3 * float(jnp.abs(wanted).max()))
     area = 0.0025**2
@@ -43,7 +43,7 @@ def followed(model, tracker, blank):
     @jax.jit
     def readings(one, moments):
         points = model.centroids
-        pressure = jnp.maximum(load_pressure(one, points) + line_shapes(one, points, SHORTEST) @ moments, 0)
+        pressure = jnp.maximum(load_pressure(one, points) + line_shapes(one, points, MIN_HALF_LENGTH) @ moments, 0)
         return je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
 
     told = []
@@ -81,12 +81,12 @@ def test_frames_do_not_lessen_what_an_unknown_shape_causes(followed):
 
 def test_what_was_found_for_other_contacts_is_not_added():
     found = ConsiderErrors((3,), np.zeros((1, 6)), np.eye(6)[None])
-    np.testing.assert_array_equal(found.added(2, np.zeros((8, 8))), np.zeros((8, 8)))
-    np.testing.assert_array_equal(np.diag(found.added(3, np.zeros((8, 8)))), [1, 1, 1, 1, 1, 1, 0, 0])
+    np.testing.assert_array_equal(found.add_to(2, np.zeros((8, 8))), np.zeros((8, 8)))
+    np.testing.assert_array_equal(np.diag(found.add_to(3, np.zeros((8, 8)))), [1, 1, 1, 1, 1, 1, 0, 0])
     still = np.zeros((1, 8))
-    assert found.holds((3,), still)
-    assert not found.holds((4,), still)
-    assert not found.holds((3,), still + 0.01)
+    assert found.is_valid_for((3,), still)
+    assert not found.is_valid_for((4,), still)
+    assert not found.is_valid_for((3,), still + 0.01)
 
 
 # --- a sheet that is taken for even
@@ -113,7 +113,7 @@ def test_slopes_in_the_coat_are_those_of_the_forward_map(model, even_tracker, co
     """But for the few unknowns that are solved anew."""
     sheet, one = even_tracker.filter.sheet, jnp.array(load(0.08, 0.11, 15.0))
     gain = jnp.zeros(len(even_tracker.filter.places))
-    found = compiled(sheet.coat_slopes, one[None], gain, sheet.near(one[None]))
+    found = compiled(sheet.coat_slopes, one[None], gain, sheet.neighbourhood(one[None]))
     drawn = coats @ np.random.default_rng(1).normal(size=coats.shape[1])
     pressure = load_pressure(one, model.centroids)
 

@@ -7,7 +7,16 @@ from scipy.stats import multivariate_t
 
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import ContactLaw
-from jaxeit.tracking.contact_law import BEYOND, LEAST_SLOPE, MAX_LOG_FACTOR, SCATTER, SHAPE, SPREAD, SURE, USUAL
+from jaxeit.tracking.contact_law import (
+    EXTRAPOLATION,
+    MAX_LOG_FACTOR,
+    MIN_LOG_RATIO,
+    MIN_SLOPE,
+    PRIOR_SCATTER,
+    PRIOR_SHAPE,
+    PRIOR_STD,
+    REFERENCE_LOGS,
+)
 from jaxeit.tracking.tracks import Track
 
 from .conftest import load
@@ -24,7 +33,7 @@ def track(force, width, error=0.3, place=(0.05, 0.05)):
 def contacts(rng, count, law, spread=0.5, left=LEFT):
     """Tracks by readings alone, and true forces, N."""
     true, width = np.exp(rng.normal(np.log(10), spread, count)), np.exp(rng.normal(np.log(0.012), 0.25, count))
-    terms = np.stack([np.ones(count), np.log(true) - USUAL[0], np.log(width) - USUAL[1]], 1)
+    terms = np.stack([np.ones(count), np.log(true) - REFERENCE_LOGS[0], np.log(width) - REFERENCE_LOGS[1]], 1)
     force = true * np.exp(terms @ law + left * rng.normal(size=count))
     return [track(f, w) for f, w in zip(force, width, strict=True)], true, terms
 
@@ -40,13 +49,13 @@ def test_contacts_one_by_one_are_the_regression_in_one_piece():
     """The mean is that of ridge regression, and the evidence the ratio of the densities of all contacts at once."""
     seen, true, terms = contacts(np.random.default_rng(101), 12, TRUE)
     law, error = learned(seen, true), np.log([one.force for one in seen] / true)
-    before = np.diag((SPREAD / SCATTER) ** 2)
+    before = np.diag((PRIOR_STD / PRIOR_SCATTER) ** 2)
     precision = np.linalg.inv(before) + terms.T @ terms
     np.testing.assert_allclose(law.mean, np.linalg.solve(precision, terms.T @ error), rtol=1e-8)
     np.testing.assert_allclose(law.covariance, np.linalg.inv(precision), rtol=1e-8)
 
     def log_density(covariance):
-        return multivariate_t(np.zeros(12), SCATTER**2 * covariance, df=2 * SHAPE).logpdf(error)
+        return multivariate_t(np.zeros(12), PRIOR_SCATTER**2 * covariance, df=2 * PRIOR_SHAPE).logpdf(error)
 
     together = log_density(np.eye(12) + terms @ before @ terms.T) - log_density(np.eye(12))
     assert law.evidence == pytest.approx(together, rel=1e-9)
@@ -71,7 +80,7 @@ def test_a_layer_that_the_model_knows_is_left_alone(seed):
     seen, true, _ = contacts(rng, 120, OWN, left=0.15)
     law = learned(seen, true)
     assert not law.is_better
-    assert law.evidence < SURE
+    assert law.evidence < MIN_LOG_RATIO
     assert law.applied(seen[0]) is seen[0]
     assert "120 contacts do not speak for another law" in law.render()
 
@@ -102,12 +111,12 @@ def test_presses_of_one_force_do_not_teach_that_every_force_is_that_one(seed):
 def test_the_factor_is_bounded():
     law = learned(*contacts(np.random.default_rng(8), 40, TRUE)[:2])
     far, further = law.applied(track(1e4, 0.012)), law.applied(track(1e6, 0.012))
-    assert far.force > np.exp(law.high[0] + BEYOND)
+    assert far.force > np.exp(law.high[0] + EXTRAPOLATION)
     assert further.force / far.force == pytest.approx(100)
     assert further.log_force_error == pytest.approx(far.log_force_error)
     wild = law._replace(mean=np.array([-9.0, 0.0, 0.0])).applied(track(8.0, 0.012))
     assert wild.force == pytest.approx(8 * np.exp(MAX_LOG_FACTOR))
-    assert law._replace(mean=np.array([0.0, -5.0, 0.0])).slope == LEAST_SLOPE
+    assert law._replace(mean=np.array([0.0, -5.0, 0.0])).slope == MIN_SLOPE
 
 
 def test_ageing_leads_back_to_nothing_learned():
@@ -151,7 +160,7 @@ def test_pads_tell_an_edge_as_the_filter_says(tracker, beyond):
     errors = np.array([np.nan, 0.1, 0.1, 0.1])
     row = [*edge.position, np.log(edge.width), np.log(edge.force), *edge.half]
     sheet, contact = tracker.filter.sheet, jnp.asarray([row], tracker.filter.places.dtype)
-    loads = np.asarray(sheet.on_pads(contact, sheet.near(contact)))[0]
+    loads = np.asarray(sheet.pad_loads(contact, sheet.neighbourhood(contact)))[0]
     told = loads[np.isfinite(errors)].sum() >= 0.25 * edge.force
     assert tracker.told_by_pads((edge,), errors).tolist() == [told]
 

@@ -13,11 +13,11 @@ from jaxeit.contacts.loads.settings import LoadSettings
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import GainField, LearnedLayer, prepare_tracker
 from jaxeit.tracking.belief.apparent_gain import apparent_gain
-from jaxeit.tracking.belief.layer import MOST_EXPLAINED, OUTLIER, PRESS_VARIANCES
-from jaxeit.tracking.belief.programs import APART
-from jaxeit.tracking.belief.response import Near, load_pressure
-from jaxeit.tracking.preparation import with_errors
-from jaxeit.tracking.tracker import MOST_GAIN, bounded
+from jaxeit.tracking.belief.layer import MAX_FILTER_VARIANCE, OUTLIER_PROBABILITY, PRESS_VARIANCES
+from jaxeit.tracking.belief.programs import MIN_START_DISTANCE
+from jaxeit.tracking.belief.response import Neighbourhood, load_pressure
+from jaxeit.tracking.preparation import with_sheet_errors
+from jaxeit.tracking.tracker import MAX_GAIN, bound_gain
 
 from .conftest import SECONDS, load, with_filter
 
@@ -31,9 +31,9 @@ def test_a_gain_beyond_all_belief_is_forgotten_and_the_contacts_stay(tracker, fr
     now = tracker.start()
     for _ in range(3):
         now = tracker.step(now, frame_of([load(0.08, 0.08, 10.0)]), SECONDS)
-    assert bounded(now) is now
-    wrong = replace(now, belief=now.belief._replace(gain=now.belief.gain.at[5].set(-MOST_GAIN - 1)))
-    found = bounded(wrong).belief
+    assert bound_gain(now) is now
+    wrong = replace(now, belief=now.belief._replace(gain=now.belief.gain.at[5].set(-MAX_GAIN - 1)))
+    found = bound_gain(wrong).belief
     np.testing.assert_array_equal(found.contacts, now.belief.contacts)
     np.testing.assert_array_equal(found.covariance[:8, :8], now.belief.covariance[:8, :8])
     np.testing.assert_array_equal(found.covariance[8:, 8:], now.layer.before_press)
@@ -114,21 +114,21 @@ def test_a_press_between_the_wrong_bolts_is_begun_elsewhere(tracker, frame_of, m
     frame = frame_of([load(*true, 20.0)])
     starts = tracker.programs._starts
     wrong = starts[np.argmax(np.linalg.norm(starts - true, axis=1))]
-    best = tracker.programs.explaining_places
-    monkeypatch.setattr(tracker.programs, "explaining_places", lambda left: iter([wrong]))
+    best = tracker.programs.matched_positions
+    monkeypatch.setattr(tracker.programs, "matched_positions", lambda left: iter([wrong]))
     assert np.linalg.norm(tracker.press(frame).tracks[0].position - true) > 0.02
-    monkeypatch.setattr(tracker.programs, "explaining_places", lambda left: iter([wrong, *best(left)]))
+    monkeypatch.setattr(tracker.programs, "matched_positions", lambda left: iter([wrong, *best(left)]))
     assert np.linalg.norm(tracker.press(frame).tracks[0].position - true) < 1e-3
 
 
 def test_places_where_a_contact_may_begin_are_apart(tracker, frame_of):
-    left = tracker.programs.unexplained(
+    left = tracker.programs.innovation(
         tracker.start().belief, tracker.frame(frame_of([load(0.1, 0.1, 9.0)])), tracker.pads(None, None)
     )
-    places = np.array(list(tracker.programs.explaining_places(left)))
-    np.testing.assert_array_equal(places[0], tracker.programs.explaining_place(left))
+    places = np.array(list(tracker.programs.matched_positions(left)))
+    np.testing.assert_array_equal(places[0], tracker.programs.matched_position(left))
     away = np.linalg.norm(places[:, None] - places, axis=-1)
-    assert away[np.triu_indices(len(places), 1)].min() >= APART
+    assert away[np.triu_indices(len(places), 1)].min() >= MIN_START_DISTANCE
 
 
 def told_directions(tracker, seed, count):
@@ -140,8 +140,8 @@ def told_directions(tracker, seed, count):
     sheet, rng, size = tracker.filter.sheet, np.random.default_rng([702, seed]), len(tracker.field.places)
     elements, pixels = len(sheet.sigma), len(sheet.pixels)
     every = (jnp.arange(elements), jnp.arange(len(sheet.sheet.green)), jnp.arange(pixels))
-    whole = Near(*every, jnp.ones(elements, bool), jnp.ones(pixels, bool))
-    shown = jax.jit(lambda contact, gain: sheet.shown(contact, gain, jnp.zeros(0, jnp.int32), whole))
+    whole = Neighbourhood(*every, jnp.ones(elements, bool), jnp.ones(pixels, bool))
+    shown = jax.jit(lambda contact, gain: sheet.predict_measurement(contact, gain, jnp.zeros(0, jnp.int32), whole))
     frame_of = np.linalg.pinv(np.asarray(tracker.filter.compress))
     before = tracker.start(known_variance(0.0, tracker.field))
     for _ in range(count):
@@ -174,7 +174,7 @@ def test_a_press_states_the_error_of_the_gain_under_it(model, skin, blank):
 
 def test_the_effect_of_a_press_does_not_move_contacts_and_is_in_the_error_of_forces(tracker, frame_of):
     """Presses that differ by a variance of ten: readings hardly tell a force, pads do, and places stay as they are."""
-    layers = [known_variance(variance, tracker.field) for variance in (MOST_EXPLAINED, 10.0)]
+    layers = [known_variance(variance, tracker.field) for variance in (MAX_FILTER_VARIANCE, 10.0)]
     frames = [frame_of([load(0.05, 0.06, max(force, 1e-6))]) for force in (0.0, 10.0, 10.0)]
     states = [tracker.start(layer) for layer in layers]
     for frame in frames:
@@ -182,7 +182,7 @@ def test_the_effect_of_a_press_does_not_move_contacts_and_is_in_the_error_of_for
     ((few,), (many,)) = (now.tracks for now in states)
     np.testing.assert_allclose(many.position, few.position, rtol=1e-9)
     np.testing.assert_allclose(many.covariance, few.covariance, rtol=1e-9)
-    added = np.sqrt((many.log_force_error**2 - few.log_force_error**2) / (10.0 - MOST_EXPLAINED))
+    added = np.sqrt((many.log_force_error**2 - few.log_force_error**2) / (10.0 - MAX_FILTER_VARIANCE))
     assert 0.8 < added / np.hypot(tracker.field.level, tracker.field.deviation) < 1.1
     now = tracker.start(layers[1])
     for frame, force in zip(frames, (0.0, 1.0, 1.0), strict=True):
@@ -362,10 +362,10 @@ def test_a_sheet_that_is_wrong_looks_like_gain(model, tracker):
     layer, at = before.layer, np.stack(np.meshgrid(*2 * [np.linspace(0.04, 0.16, 5)]), -1).reshape(-1, 2)
     for place in at:
         one = jnp.array(load(*place, loads.force, loads.width))
-        on_pads = np.asarray(sheet.on_pads(one[None], tracker.of_presses.sheet.near(one[None])))[0]
+        on_pads = np.asarray(sheet.pad_loads(one[None], tracker.press_filter.sheet.neighbourhood(one[None])))[0]
         layer = tracker.learned(tracker.press(np.asarray(change(one)), on_pads, np.full(4, 0.05), layer=layer))
     usual = np.log([loads.width, loads.force])
-    foreseen = apparent_gain(tracker.filter, with_errors(sheet, model, error[:, None]), usual, loads.gain_length)
+    foreseen = apparent_gain(tracker.filter, with_sheet_errors(sheet, model, error[:, None]), usual, loads.gain_length)
     expected, (mean, _) = tracker.field.modes_at(at) @ foreseen[:, 0], layer.at(at)
     mean = mean - mean.mean()  # the mesh errs by about as much everywhere
     assert np.corrcoef(mean, expected)[0, 1] > 0.9
@@ -375,7 +375,7 @@ def test_a_sheet_that_is_wrong_looks_like_gain(model, tracker):
 def test_no_single_press_rules_a_variance_out():
     ((layer, _),) = after_presses(np.random.default_rng(704), (10,), 0.0)
     wild = layer.told(layer.mean + 100, 0.5 * layer.before_press, 1)
-    assert (wild.evidence - layer.evidence).min() >= np.log(OUTLIER) - 1e-9
+    assert (wild.evidence - layer.evidence).min() >= np.log(OUTLIER_PROBABILITY) - 1e-9
     assert np.ptp(wild.evidence - layer.evidence) > 1
 
 

@@ -6,11 +6,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxeit.tracking.belief.filter import PIECE, STEPS, Pads
+from jaxeit.tracking.belief.filter import MAX_STEPS, PIECE_STEPS, Pads
 from jaxeit.tracking.belief.programs import Programs
-from jaxeit.tracking.events import jumped
-from jaxeit.tracking.looks import KEPT, LONGEST_WAIT, begun, is_doubted, looked, meanwhile, settled
-from jaxeit.tracking.tracks import MOST_PATIENCE, PATIENCE, Seen
+from jaxeit.tracking.events import allow_jumps
+from jaxeit.tracking.looks import (
+    MAX_WAIT,
+    MAX_WAITING,
+    advance_look,
+    apply_update,
+    begin_look,
+    needs_recount,
+    queue_frame,
+)
+from jaxeit.tracking.tracks import MAX_PATIENCE, PATIENCE, Observation
 
 from .conftest import SECONDS, load
 
@@ -20,22 +28,22 @@ PIECES = 6  # of a look, in each frame
 class CountingPrograms(Programs):
     """Counts the evaluations of what contacts show."""
 
-    solves = 0
+    evaluations = 0
 
-    def followed(self, *args):
-        found = super().followed(*args)
-        self.solves += int(found[1].solves)
+    def predict_and_update(self, *args):
+        found = super().predict_and_update(*args)
+        self.evaluations += int(found[1].evaluations)
         return found
 
-    def attempted(self, belief, dv, pads, attempt):
-        found = super().attempted(belief, dv, pads, attempt)
+    def advance(self, belief, dv, pads, attempt):
+        found = super().advance(belief, dv, pads, attempt)
         steps = [0 if one is None or one.state is None else int(one.state.steps) for one in (attempt, found)]
-        self.solves += steps[1] - steps[0]
+        self.evaluations += steps[1] - steps[0]
         return found
 
-    def unexplained_place(self, *args):
-        self.solves += 1
-        return super().unexplained_place(*args)
+    def birth_position(self, *args):
+        self.evaluations += 1
+        return super().birth_position(*args)
 
 
 def truth(k):
@@ -50,13 +58,13 @@ def followed(tracker, frame_of):
     counting, states, frames, pieces = CountingPrograms(tracker.filter), [], [], []
     kept, tracker.programs, now = tracker.programs, counting, tracker.start()
     for k in range(70):
-        before = counting.solves
+        before = counting.evaluations
         now = tracker.step(now, frame_of(truth(k) or [load(0.1, 0.1, 1e-6)]), SECONDS, whole=False)
-        frames.append(counting.solves - before)
+        frames.append(counting.evaluations - before)
         for _ in range(PIECES):
-            before = counting.solves
+            before = counting.evaluations
             now = tracker.look(now)
-            pieces.append(counting.solves - before)
+            pieces.append(counting.evaluations - before)
         states.append(now)
     tracker.programs = kept
     return states, frames, pieces
@@ -64,8 +72,8 @@ def followed(tracker, frame_of):
 
 def test_no_frame_does_more_than_a_bounded_number_of_solves(followed):
     _, frames, pieces = followed
-    assert 0 < max(frames) <= STEPS
-    assert PIECE <= max(pieces) <= STEPS
+    assert 0 < max(frames) <= MAX_STEPS
+    assert PIECE_STEPS <= max(pieces) <= MAX_STEPS
     assert sum(pieces) > 60  # more than one frame may do: they were spread
 
 
@@ -106,13 +114,15 @@ def two_contacts(tracker, frame, places, doubted=True):
     for place in places:
         belief = tracker.events.with_contact(belief, np.asarray(place))
     now = replace(tracker.start(), belief=belief, numbers=(1, 2), edges=(False,) * 2, faint=(0,) * 2, begun=2)
-    now = settled(now, tracker.programs.careful(belief, tracker.frame(frame), tracker.pads(None, None)))
-    return replace(now, belief=jumped(now.belief) if doubted else now.belief, since=PATIENCE)
+    now = apply_update(
+        now, tracker.programs.single_frame_update(belief, tracker.frame(frame), tracker.pads(None, None))
+    )
+    return replace(now, belief=allow_jumps(now.belief) if doubted else now.belief, since=PATIENCE)
 
 
 def test_two_contacts_that_are_one_are_counted_again(tracker, frame_of):
     now = two_contacts(tracker, frame_of([load(0.06, 0.08, 10.0)]), [(0.055, 0.078), (0.066, 0.084)], doubted=False)
-    assert is_doubted(now)
+    assert needs_recount(now)
     for _ in range(2):
         now = tracker.step(now, frame_of([load(0.06, 0.08, 10.0)]), SECONDS)
     (track,) = now.tracks
@@ -123,8 +133,8 @@ def test_two_contacts_that_are_one_are_counted_again(tracker, frame_of):
 def test_two_contacts_that_are_counted_again_stay_two(tracker, frame_of):
     truth = [load(0.06, 0.08, 10.0), load(0.085, 0.08, 8.0)]
     now = two_contacts(tracker, frame_of(truth), [one[:2] for one in truth])
-    assert is_doubted(now)
-    assert not is_doubted(replace(now, since=0))
+    assert needs_recount(now)
+    assert not needs_recount(replace(now, since=0))
     now = tracker.step(now, frame_of(truth), SECONDS)
     assert now.numbers == (1, 2)
     assert now.since == 0  # they were counted
@@ -145,24 +155,24 @@ def test_what_no_event_explains_is_asked_about_less_and_less_often(tracker, fram
     assert now.numbers == (1,)
     between = np.diff(asked) - 1
     assert len(between) >= 2
-    assert (between[1:] == np.minimum(2 * between[:-1], MOST_PATIENCE)).all()
-    assert PATIENCE <= between[0] <= MOST_PATIENCE == between[-1]
+    assert (between[1:] == np.minimum(2 * between[:-1], MAX_PATIENCE)).all()
+    assert PATIENCE <= between[0] <= MAX_PATIENCE == between[-1]
 
 
 def seen(number):
-    return Seen(np.full(1, number), Pads(np.zeros(1), np.ones(1)), 1.0)
+    return Observation(np.full(1, number), Pads(np.zeros(1), np.ones(1)), 1.0)
 
 
 def test_frames_that_wait_are_thinned_and_no_second_is_lost(followed):
     backlog = next(state.backlog for state in followed[0] if state.backlog and state.backlog.look)
     backlog = replace(backlog, waiting=())
     for k in range(1, 50):
-        backlog = meanwhile(backlog, seen(k))
-        assert len(backlog.waiting) <= KEPT
+        backlog = queue_frame(backlog, seen(k))
+        assert len(backlog.waiting) <= MAX_WAITING
         assert sum(frame.seconds for frame in backlog.waiting) == k
         assert backlog.waiting[-1].dv == k  # the newest frame is kept as it is
     count = len(backlog.waiting)
-    backlog = meanwhile(replace(backlog, look=None), seen(50))
+    backlog = queue_frame(replace(backlog, look=None), seen(50))
     assert len(backlog.waiting) == count  # while frames are followed, they do not become more
     assert sum(frame.seconds for frame in backlog.waiting) == 50
 
@@ -186,7 +196,7 @@ def test_contacts_begin_anew_after_an_update_that_is_not_finite(tracker, frame_o
 def test_without_spare_time_contacts_are_given_up_and_found_again_once_there_is_some(tracker, frame_of, followed):
     """A machine that is too slow for looks tells no contact, rather than one that has moved on unseen."""
     now = next(state for state in followed[0] if state.backlog is not None and state.numbers)
-    still, quarter = frame_of(truth(55)), LONGEST_WAIT / 4  # one contact is left
+    still, quarter = frame_of(truth(55)), MAX_WAIT / 4  # one contact is left
     shown = []
     for _ in range(16):
         now = tracker.step(now, still, quarter, whole=False)
@@ -209,7 +219,7 @@ def test_without_spare_time_a_contact_that_rests_keeps_its_number(tracker, frame
     now = tracker.step(now, frame_of([*held, load(0.06, 0.12, 9.0)]), SECONDS, whole=False)
     assert now.backlog is not None
     for _ in range(16):
-        now = tracker.step(now, frame_of(held), LONGEST_WAIT / 4, whole=False)
+        now = tracker.step(now, frame_of(held), MAX_WAIT / 4, whole=False)
         assert now.numbers == (1,)
     assert now.backlog is None
     assert np.linalg.norm(now.tracks[0].position - held[0][:2]) < 1e-3
@@ -223,7 +233,7 @@ def test_a_force_that_grows_fiftyfold_in_a_frame_is_one_contact(tracker, frame_o
     now, sheet = tracker.start(), tracker.filter.sheet
     for force in (before, after, after):
         loads = jnp.asarray([load(*place, force)])
-        on_pads = np.asarray(sheet.on_pads(loads, sheet.near(loads))).sum(0)
+        on_pads = np.asarray(sheet.pad_loads(loads, sheet.neighbourhood(loads))).sum(0)
         now = tracker.step(now, frame_of(loads.tolist()), 0.1, on_pads, np.hypot(0.05, 0.05 * on_pads))
         assert now.numbers == (1,)
     (track,) = now.tracks
@@ -250,12 +260,12 @@ def test_events_are_asked_about_only_where_contacts_leave_something(tracker, fra
     loads = [load(0.05, 0.05, 10.0)]
     before = tracker.step(tracker.start(), frame_of(loads), SECONDS)
     frame = frame_of([load(0.05, 0.05, 10.5), *[load(0.15, 0.15, 5.0)] * second])
-    seen = Seen(tracker.frame(frame), tracker.pads(None, None), SECONDS)
-    moved, update = tracker.programs.followed(before.belief, *seen)
-    look = begun(replace(before, belief=moved), settled(before, update), seen)
+    seen = Observation(tracker.frame(frame), tracker.pads(None, None), SECONDS)
+    predicted, update = tracker.programs.predict_and_update(before.belief, *seen)
+    look = begin_look(replace(before, belief=predicted), apply_update(before, update), seen)
     asked = False
     while look.after is None:
-        look = looked(look, tracker.programs, tracker.events)
+        look = advance_look(look, tracker.programs, tracker.events)
         asked = asked or look.trials is not None
     assert asked == second
     assert len(look.after.numbers) == 1 + second

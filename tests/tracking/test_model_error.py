@@ -10,7 +10,7 @@ from jaxeit.imaging import InverseError
 from jaxeit.tracking import fit_model_error, model_error, press_evidence
 from jaxeit.tracking.belief.filter import CONTACT_SIZE
 from jaxeit.tracking.belief.programs import Programs
-from jaxeit.tracking.preparation import MESH_GAIN
+from jaxeit.tracking.preparation import MESH_ERROR_RATIO
 
 from .conftest import SECONDS, load
 
@@ -48,16 +48,16 @@ def test_the_error_that_was_made_is_found(tracker, humble, presses):
     truth = np.median([np.linalg.norm(error) / np.linalg.norm(signal) for error, signal in zip(*parts, strict=True)])
     assert truth / STEP < humble.settings.loads.model_error < truth * STEP**2
     assert float(humble.filter.model_error) == pytest.approx(humble.settings.loads.model_error)
-    assert humble.field.mesh_error == MESH_GAIN * humble.settings.loads.model_error
+    assert humble.field.mesh_error == MESH_ERROR_RATIO * humble.settings.loads.model_error
 
 
 def test_a_fit_that_begins_at_the_wrong_place_asks_for_no_error(tracker, presses, monkeypatch):
     """A press between bolts is found from another place: the model is right, and its error stays the least."""
     expected = fit_model_error(tracker, presses[:2]).settings.loads.model_error
-    best = Programs.explaining_places
+    best = Programs.matched_positions
     wrong = np.array([0.02, 0.18])
-    monkeypatch.setattr(Programs, "explaining_place", lambda self, left: wrong)
-    monkeypatch.setattr(Programs, "explaining_places", lambda self, left: iter([wrong, *best(self, left)]))
+    monkeypatch.setattr(Programs, "matched_position", lambda self, left: wrong)
+    monkeypatch.setattr(Programs, "matched_positions", lambda self, left: iter([wrong, *best(self, left)]))
     assert fit_model_error(tracker, presses[:2]).settings.loads.model_error == expected
 
 
@@ -77,8 +77,8 @@ def test_frames_whose_fit_does_not_converge_are_left_out_or_refused(tracker, pre
 def test_a_fit_that_has_not_converged_has_no_probability(tracker, presses, monkeypatch):
     frame, pads = tracker.frame(presses[0]), tracker.pads(None, None)
     assert np.isfinite(model_error._evidence(tracker, frame, pads))
-    whole = tracker.programs.completed  # of the second fit, from the place that was found
-    monkeypatch.setattr(tracker.programs, "completed", lambda belief, dv, pads, most: whole(belief, dv, pads, 1))
+    whole = tracker.programs.converge  # of the second fit, from the place that was found
+    monkeypatch.setattr(tracker.programs, "converge", lambda belief, dv, pads, most: whole(belief, dv, pads, 1))
     assert model_error._evidence(tracker, frame, pads) == -np.inf
 
 

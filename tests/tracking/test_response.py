@@ -12,7 +12,7 @@ from jaxeit.model.sensitivity import pair_jacobian
 from jaxeit.tracking import prepare_tracker
 from jaxeit.tracking.belief.reanalysis import prepare_reanalysis
 from jaxeit.tracking.belief.response import load_pressure, load_slopes
-from jaxeit.tracking.preparation import squares_to_lines
+from jaxeit.tracking.preparation import squared_line_distances
 from tests.compiled import compiled
 
 from .conftest import in_double_precision
@@ -62,7 +62,7 @@ def first_order(model, whitened):
 
 def test_with_all_unknowns_reanalysis_is_the_forward_map(model, whitened, sheet, touched, first_order):
     change, elements = touched
-    found = compiled(sheet.beyond, elements, _all_unknowns(sheet), change[elements])
+    found = compiled(sheet.nonlinear_part, elements, _all_unknowns(sheet), change[elements])
     moved = je.forward(model, model.background + change) - je.forward(model, model.background)
     exact = whitened.compress @ whitened.whitening.sums(moved)
     assert jnp.linalg.norm(exact) > 500
@@ -86,13 +86,13 @@ def test_slopes_along_a_coat_are_those_of_the_forward_map(model, whitened, sheet
 
 def test_fewer_unknowns_err_less_than_noise(sheet, touched):
     change, elements = touched
-    every = compiled(sheet.beyond, elements, _all_unknowns(sheet), change[elements]).readings
+    every = compiled(sheet.nonlinear_part, elements, _all_unknowns(sheet), change[elements]).readings
     around = jnp.zeros(len(sheet.green)).at[sheet.dofs].max(change[:, None])
     errors = []
     for size in (48, 96, 192):
         chosen = jax.lax.top_k(around, size)[1]
         errors.append(
-            float(jnp.linalg.norm(compiled(sheet.beyond, elements, chosen, change[elements]).readings - every))
+            float(jnp.linalg.norm(compiled(sheet.nonlinear_part, elements, chosen, change[elements]).readings - every))
         )
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < 1 < jnp.linalg.norm(every)
@@ -101,9 +101,9 @@ def test_fewer_unknowns_err_less_than_noise(sheet, touched):
 def test_what_occurs_twice_counts_once(sheet, touched):
     change, elements = touched
     few, unknowns = elements[:150], jnp.unique(sheet.dofs[elements[:150]])
-    once = compiled(sheet.beyond, few, unknowns, change[few]).readings
+    once = compiled(sheet.nonlinear_part, few, unknowns, change[few]).readings
     both, twice = jnp.concatenate([few, few[:40]]), jnp.concatenate([unknowns, unknowns[:30]])
-    again = compiled(sheet.beyond, both, twice, jnp.concatenate([change[few], jnp.zeros(40)])).readings
+    again = compiled(sheet.nonlinear_part, both, twice, jnp.concatenate([change[few], jnp.zeros(40)])).readings
     np.testing.assert_allclose(again, once, atol=1e-8)
 
 
@@ -112,9 +112,11 @@ def test_slopes_of_reanalysis_are_differences(sheet, touched):
     few = elements[:150]
     unknowns, size = jnp.unique(sheet.dofs[few]), 1e-5
     direction = jnp.sin(jnp.arange(150.0)) * change[few]
-    sides = [compiled(sheet.beyond, few, unknowns, change[few] + s * size * direction).readings for s in (1, -1)]
-    found = compiled(sheet.beyond, few, unknowns, change[few])
-    slope = compiled(sheet.beyond_slopes, found, direction[None])[0]
+    sides = [
+        compiled(sheet.nonlinear_part, few, unknowns, change[few] + s * size * direction).readings for s in (1, -1)
+    ]
+    found = compiled(sheet.nonlinear_part, few, unknowns, change[few])
+    slope = compiled(sheet.nonlinear_slopes, found, direction[None])[0]
     np.testing.assert_allclose(slope, (sides[0] - sides[1]) / (2 * size), atol=1e-6 * float(jnp.linalg.norm(slope)))
 
 
@@ -128,11 +130,11 @@ def test_what_contacts_show_has_the_slopes_of_differences(exact):
     """Place, width, force, length and gain; forces on pads too."""
     modes = jnp.array([0, 40, 77])
     gain = 0.3 * jnp.cos(jnp.arange(exact.modes.shape[1], dtype=float))
-    near = exact.near(LOADS)
+    near = exact.neighbourhood(LOADS)
 
     @jax.jit
     def shown(numbers):
-        found = exact.shown(numbers[:12].reshape(2, 6), gain.at[modes].add(numbers[12:]), modes, near)
+        found = exact.predict_measurement(numbers[:12].reshape(2, 6), gain.at[modes].add(numbers[12:]), modes, near)
         return jnp.concatenate([found.readings, found.pads]), found
 
     start = jnp.concatenate([LOADS.ravel(), jnp.zeros(3)])
@@ -151,7 +153,7 @@ def test_what_contacts_show_is_near_the_full_forward_map(model, tracker, blank, 
     v = je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
     wanted = tracker.filter.compress @ (v - blank[0])
     gain = jnp.zeros(exact.modes.shape[1])
-    found = compiled(exact.shown, LOADS, gain, jnp.array([0]), exact.near(LOADS)).readings
+    found = compiled(exact.predict_measurement, LOADS, gain, jnp.array([0]), exact.neighbourhood(LOADS)).readings
     assert jnp.linalg.norm(found - wanted) < 0.02 * jnp.linalg.norm(wanted)
 
 
@@ -161,7 +163,7 @@ def test_distances_from_loads_are_those_from_their_lines():
     halves = np.array([[0, 0], [0.01, 0.02], [-0.03, 0]])
     lines = middles[:, None] + np.linspace(-1, 1, 2001)[:, None] * halves[:, None, None]  # (edges, n, points, 2)
     sampled = np.linalg.norm(lines[:, :, None] - places[:, None], axis=-1).min(-1)
-    np.testing.assert_allclose(np.sqrt(squares_to_lines(middles, places, halves)), sampled, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(np.sqrt(squared_line_distances(middles, places, halves)), sampled, rtol=1e-3, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -178,15 +180,19 @@ def test_a_contact_is_as_wide_on_a_small_sheet(side):
     v = je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
     wanted = small.filter.compress @ (v - je.forward(model))
     sheet = small.filter.sheet
-    found = sheet.shown(pressed, jnp.zeros(sheet.modes.shape[1]), jnp.array([0]), sheet.near(pressed)).readings
+    found = sheet.predict_measurement(
+        pressed, jnp.zeros(sheet.modes.shape[1]), jnp.array([0]), sheet.neighbourhood(pressed)
+    ).readings
     assert jnp.linalg.norm(found - wanted) < 0.02 * jnp.linalg.norm(wanted)
 
 
 @pytest.mark.slow
 def test_single_precision_errs_below_a_tenth_of_the_noise(tracker, exact):
     gain = jnp.zeros(exact.modes.shape[1])
-    single = compiled(tracker.filter.sheet.shown, LOADS, gain, jnp.array([0]), exact.near(LOADS)).readings
-    double = compiled(exact.shown, LOADS, gain, jnp.array([0]), exact.near(LOADS)).readings
+    single = compiled(
+        tracker.filter.sheet.predict_measurement, LOADS, gain, jnp.array([0]), exact.neighbourhood(LOADS)
+    ).readings
+    double = compiled(exact.predict_measurement, LOADS, gain, jnp.array([0]), exact.neighbourhood(LOADS)).readings
     assert single.dtype == double.dtype
     assert jnp.max(jnp.abs(single - double)) < 0.1
 
@@ -206,7 +212,9 @@ def test_a_load_on_a_pad_is_felt_by_it(tracker):
     """The pads of the testbed cover its quarters, but for gaps."""
     sheet = tracker.filter.sheet
     load = jnp.array([[0.05, 0.05, np.log(0.008), np.log(10.0), 0, 0]])
-    found = compiled(sheet.shown, load, jnp.zeros(sheet.modes.shape[1]), jnp.array([0]), sheet.near(load))
+    found = compiled(
+        sheet.predict_measurement, load, jnp.zeros(sheet.modes.shape[1]), jnp.array([0]), sheet.neighbourhood(load)
+    )
     np.testing.assert_allclose(sorted(found.pads), [0, 0, 0, 10], atol=0.3)
 
 

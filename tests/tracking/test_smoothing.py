@@ -6,7 +6,7 @@ import pytest
 
 import jaxeit as je
 from jaxeit.tracking.belief.filter import CONTACT_SIZE as SIZE
-from jaxeit.tracking.smoothing import Smoother, State, Transition, smoothed, transition
+from jaxeit.tracking.smoothing import Smoother, State, Transition, smooth, transition_after
 
 FRAMES, SEEN = 7, 3
 
@@ -56,13 +56,13 @@ def all_at_once(steps, matrix, noise, data, prior):
 def test_smoothed_states_are_those_given_all_frames_at_once(toy):
     states, steps = filtered(*toy), toy[0]
     mean, covariance = all_at_once(*toy)
-    for n, (state, before) in enumerate(zip(smoothed(states, steps), states, strict=True)):
+    for n, (state, before) in enumerate(zip(smooth(states, steps), states, strict=True)):
         own = slice(SIZE * n, SIZE * (n + 1))
         np.testing.assert_allclose(state.mean, mean[n], rtol=1e-9, atol=1e-10)
         np.testing.assert_allclose(state.covariance, covariance[own, own], rtol=1e-8, atol=1e-10)
         assert np.linalg.eigvalsh(state.covariance)[0] > 0
         assert np.linalg.eigvalsh(before.covariance - state.covariance)[0] > -1e-12
-    assert smoothed(states[:1], []) == states[:1]
+    assert smooth(states[:1], []) == states[:1]
 
 
 def test_later_frames_tell_nothing_across_a_jump(toy):
@@ -70,10 +70,10 @@ def test_later_frames_tell_nothing_across_a_jump(toy):
     ahead = steps[3].matrix @ states[3].covariance @ steps[3].matrix.T + steps[3].walk
     jump = State(states[4].mean + 5, ahead + 4 * np.eye(SIZE))
     after = filtered(steps[4:], *toy[1:3], toy[3][4:], jump.covariance)
-    found = smoothed([*states[:4], *after], steps)
+    found = smooth([*states[:4], *after], steps)
     np.testing.assert_array_equal(found[3].mean, states[3].mean)
     np.testing.assert_array_equal(found[3].covariance, states[3].covariance)
-    for state, alone in zip(found[:4], smoothed(states[:4], steps[:3]), strict=True):
+    for state, alone in zip(found[:4], smooth(states[:4], steps[:3]), strict=True):
         np.testing.assert_array_equal(state.mean, alone.mean)
 
 
@@ -81,13 +81,13 @@ def test_covariances_stay_definite_where_next_to_nothing_changes(toy):
     """Steps so short that a covariance less another loses all its digits."""
     _, matrix, noise, data, prior = toy
     steps = [Transition(np.eye(SIZE), 1e-18 * np.eye(SIZE))] * (FRAMES - 1)
-    for state in smoothed(filtered(steps, matrix, noise, data, prior), steps):
+    for state in smooth(filtered(steps, matrix, noise, data, prior), steps):
         assert np.linalg.eigvalsh(state.covariance)[0] > 0
 
 
 def test_the_transition_is_that_of_the_filter(tracker):
     """A place moves on by its velocity; a velocity that walks at random makes a place walk as its integral does."""
-    found = transition(tracker, 0.1)
+    found = transition_after(tracker, 0.1)
     start = np.arange(1.0, SIZE + 1)
     np.testing.assert_allclose(found.matrix @ start, start + 0.1 * np.array([7, 8, 0, 0, 0, 0, 0, 0]))
     drift = tracker.settings.acceleration**2

@@ -9,13 +9,13 @@ from jaxeit.imaging import InverseError
 from jaxeit.tracking import TrackerSettings, prepare_tracker
 from jaxeit.tracking.belief.filter import (
     CONTACT_SIZE,
-    SEEN_SIZE,
-    WIDER,
+    LOAD_SIZE,
+    TAIL_WIDTH_RATIO,
     Pads,
-    active_numbers,
-    predicted,
-    telling_pads,
-    updated,
+    active_indices,
+    informative_pads,
+    predict,
+    update,
 )
 
 from .conftest import SECONDS, SETTINGS, in_double_precision, load, with_filter
@@ -86,9 +86,9 @@ def test_pads_tell_the_force(tracker, frame_of):
     """An image alone confuses force and gain; a pad with an error of 1 % does not."""
     truth = np.array([load(0.05, 0.05, 12.0)])
     sheet = tracker.filter.sheet
-    near = sheet.near(jnp.asarray(truth))
+    near = sheet.neighbourhood(jnp.asarray(truth))
     forces = np.asarray(
-        sheet.shown(jnp.asarray(truth), jnp.zeros(len(tracker.filter.places)), jnp.array([0]), near).pads
+        sheet.predict_measurement(jnp.asarray(truth), jnp.zeros(len(tracker.filter.places)), jnp.array([0]), near).pads
     )
     now = tracker.start()
     for _ in range(3):
@@ -130,14 +130,16 @@ def test_pads_err_by_what_they_would_bear_of_a_wider_load(tracker):
     """Of a load 12 mm from their border, whose integral is known."""
     width, away, given = 0.008, 0.012, np.array([0.3, 0.4, 0.5, np.inf])
     contacts = jnp.array([[*load(0.1 - away, 0.05, 10.0, width), 0.0, 0.0]])
-    near = tracker.filter.sheet.near(contacts[:, :SEEN_SIZE])
-    found = telling_pads(tracker.filter, contacts, near, Pads(jnp.zeros(4), jnp.asarray(given))).error
-    beyond = norm.sf(away / np.array([width, WIDER * width])) * norm.cdf(0.05 / np.array([width, WIDER * width]))
+    near = tracker.filter.sheet.neighbourhood(contacts[:, :LOAD_SIZE])
+    found = informative_pads(tracker.filter, contacts, near, Pads(jnp.zeros(4), jnp.asarray(given))).error
+    beyond = norm.sf(away / np.array([width, TAIL_WIDTH_RATIO * width])) * norm.cdf(
+        0.05 / np.array([width, TAIL_WIDTH_RATIO * width])
+    )
     expected = np.hypot(given[1], TrackerSettings().tail * 10 * np.diff(beyond)[0])
     assert found[1] == pytest.approx(expected, rel=0.15)  # pixels, and what lies beyond those that are near
     assert found[2] == pytest.approx(given[2], rel=0.05)
     assert np.isinf(found[3])
-    same = telling_pads(tracker.filter, contacts.at[0, 3].set(-20.0), near, Pads(jnp.zeros(4), jnp.asarray(given)))
+    same = informative_pads(tracker.filter, contacts.at[0, 3].set(-20.0), near, Pads(jnp.zeros(4), jnp.asarray(given)))
     np.testing.assert_allclose(same.error, given, rtol=1e-6)
 
 
@@ -172,18 +174,18 @@ def test_missing_readings_are_left_out(tracker, frame_of, followed):
 def test_an_update_is_the_conditional_normal_distribution(tracker, followed):
     """At a frame as it is expected: the covariance given the frame, by dense algebra."""
     filter_, belief = map(in_double_precision, (tracker.filter, followed[0][6].belief))
-    belief = predicted(filter_, belief, jnp.asarray(SECONDS))
-    active = np.asarray(active_numbers(filter_, belief.contacts))
-    contacts = belief.contacts[:, :SEEN_SIZE]
-    modes, near = jnp.asarray(active[SEEN_SIZE:] - CONTACT_SIZE), filter_.sheet.near(contacts)
-    shown = filter_.sheet.shown(contacts, belief.gain, modes, near)
-    y, compress = np.asarray(shown.readings), np.asarray(filter_.compress)
+    belief = predict(filter_, belief, jnp.asarray(SECONDS))
+    active = np.asarray(active_indices(filter_, belief.contacts))
+    contacts = belief.contacts[:, :LOAD_SIZE]
+    modes, near = jnp.asarray(active[LOAD_SIZE:] - CONTACT_SIZE), filter_.sheet.neighbourhood(contacts)
+    predicted = filter_.sheet.predict_measurement(contacts, belief.gain, modes, near)
+    y, compress = np.asarray(predicted.readings), np.asarray(filter_.compress)
     frame = np.linalg.lstsq(compress, y)[0]
     np.testing.assert_allclose(compress @ frame, y, atol=1e-9)
-    found = updated(filter_, belief, frame, silent(tracker), jnp.asarray(1e3)).belief
+    found = update(filter_, belief, frame, silent(tracker), jnp.asarray(1e3)).belief
     np.testing.assert_allclose(found.contacts, belief.contacts, atol=1e-9)
     slopes, prior = np.zeros((len(y), len(belief.covariance))), np.asarray(belief.covariance)
-    slopes[:, active] = np.asarray(shown.reading_slopes).T
+    slopes[:, active] = np.asarray(predicted.reading_slopes).T
     variance = 1 + float(filter_.error_share) * (y @ y) / len(y)
     gain = np.linalg.solve(slopes @ prior @ slopes.T + variance * np.eye(len(y)), slopes @ prior).T
     wanted = prior - gain @ slopes @ prior
@@ -195,8 +197,8 @@ def test_a_belief_moves_by_the_integrated_random_walk(tracker, followed):
     belief, filter_ = followed[0][10].belief, tracker.filter
     steps = belief
     for _ in range(4):
-        steps = predicted(filter_, steps, jnp.asarray(SECONDS / 4))
-    once = predicted(filter_, belief, jnp.asarray(SECONDS))
+        steps = predict(filter_, steps, jnp.asarray(SECONDS / 4))
+    once = predict(filter_, belief, jnp.asarray(SECONDS))
     np.testing.assert_allclose(steps.contacts, once.contacts, rtol=1e-12)
     np.testing.assert_allclose(steps.covariance, once.covariance, rtol=1e-6, atol=1e-16)
     np.testing.assert_allclose(steps.gain, once.gain, rtol=1e-6)

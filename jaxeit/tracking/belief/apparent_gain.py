@@ -18,60 +18,61 @@ from jaxtyping import Array, Float, Int
 
 from ..._compile import verb
 from ...linalg import lapack
-from .filter import CONTACT_SIZE, SEEN_SIZE, ContactFilter, active_numbers
+from .filter import CONTACT_SIZE, LOAD_SIZE, ContactFilter, active_indices
 from .response import LoadedSheet
 
-# Distance of the places, in lengths of the field of the gain, and their least and largest number along a side.
-APART, ALONG = 1.6, (2, 12)
-# Numbers of a contact that presses do not tell: place and log width; pads tell the force.
-UNTOLD = 3
+# Distance of presses, in lengths of the field of the gain, and limits of their number along a side.
+PITCH_RATIO, GRID_LIMITS = 1.6, (2, 12)
+# Unknown parameters of a press: position and log width; pads tell the force.
+UNKNOWN_SIZE = 3
 
 
 def apparent_gain(
-    contact_filter: ContactFilter, sheet: LoadedSheet, usual: Float[np.ndarray, "2"], length: float
+    contact_filter: ContactFilter, sheet: LoadedSheet, log_size: Float[np.ndarray, "2"], length: float
 ) -> Float[np.ndarray, "g c"]:
     """B of the modes of the gain, (g, c), in their standard deviations.
 
     Args:
         sheet: whose `coat` holds the modes of the sheet's error.
-        usual: log width and log force of a usual load.
+        log_size: log width and log force of a usual load.
         length: of the field of the gain, m.
     """
     modes = sheet.modes.shape[1]
     if not sheet.coat.shape[1]:
         return np.zeros((modes, 0))
-    pixels, exact = np.asarray(sheet.pixels, float), contact_filter.places.dtype
+    pixels, dtype = np.asarray(sheet.pixels, float), contact_filter.places.dtype
     low, high = pixels.min(0), pixels.max(0)
-    counts = np.clip(np.ceil((high - low) / (APART * length)), *ALONG).astype(int)
+    counts = np.clip(np.ceil((high - low) / (PITCH_RATIO * length)), *GRID_LIMITS).astype(int)
     axes = [a + (b - a) * (np.arange(n) + 0.5) / n for a, b, n in zip(low, high, counts, strict=True)]
     places = np.stack(np.meshgrid(*axes), -1).reshape(math.prod(counts), 2)
-    given = (jnp.asarray(values, exact) for values in (places, usual))
-    return np.asarray(_apparent(contact_filter, sheet, *given), float)
+    given = (jnp.asarray(values, dtype) for values in (places, log_size))
+    return np.asarray(_apparent_modes(contact_filter, sheet, *given), float)
 
 
 @verb
-def _apparent(
-    contact_filter: ContactFilter, sheet: LoadedSheet, places: Float[Array, "n 2"], usual: Float[Array, "2"]
+def _apparent_modes(
+    contact_filter: ContactFilter, sheet: LoadedSheet, places: Float[Array, "n 2"], log_size: Float[Array, "2"]
 ) -> Float[Array, "g c"]:
     size = sheet.modes.shape[1]
 
-    def told(place: Float[Array, "2"]) -> tuple[Int[Array, " b"], Float[Array, "b b"], Float[Array, "b c"]]:
-        """Modes that a press tells of, and J^T J and J^T S of these."""
-        contact = jnp.concatenate([place, usual, jnp.zeros(CONTACT_SIZE - len(place) - len(usual), place.dtype)])[None]
-        modes, none = active_numbers(contact_filter, contact)[SEEN_SIZE:] - CONTACT_SIZE, jnp.zeros(size, place.dtype)
-        near = sheet.near(contact[:, :SEEN_SIZE])
-        shown = sheet.shown(contact[:, :SEEN_SIZE], none, modes, near)
-        square = shown.readings @ shown.readings / len(shown.readings)
+    def normal_equations(place: Float[Array, "2"]) -> tuple[Int[Array, " b"], Float[Array, "b b"], Float[Array, "b c"]]:
+        """Modes of the gain that a press informs, and J^T J and J^T S of these."""
+        rest = jnp.zeros(CONTACT_SIZE - len(place) - len(log_size), place.dtype)
+        contact = jnp.concatenate([place, log_size, rest])[None]
+        modes, gain = active_indices(contact_filter, contact)[LOAD_SIZE:] - CONTACT_SIZE, jnp.zeros(size, place.dtype)
+        near = sheet.neighbourhood(contact[:, :LOAD_SIZE])
+        predicted = sheet.predict_measurement(contact[:, :LOAD_SIZE], gain, modes, near)
+        square = predicted.readings @ predicted.readings / len(predicted.readings)
         scale = jnp.sqrt(1 + contact_filter.error_share * square)
-        own = contact_filter.spread[:UNTOLD, None] * shown.reading_slopes[:UNTOLD] / scale
-        root = lapack.cholesky(own @ own.T + jnp.eye(UNTOLD, dtype=own.dtype), lower=True)
-        of_gain = shown.reading_slopes[SEEN_SIZE:] / scale
-        rest = of_gain - (of_gain @ own.T) @ lapack.cho_solve((root, True), own)
-        by_sheet = sheet.coat_slopes(contact[:, :SEEN_SIZE], none, near) / scale
-        return modes, rest @ of_gain.T, rest @ by_sheet.T
+        load_slopes = contact_filter.spread[:UNKNOWN_SIZE, None] * predicted.reading_slopes[:UNKNOWN_SIZE] / scale
+        root = lapack.cholesky(load_slopes @ load_slopes.T + jnp.eye(UNKNOWN_SIZE, dtype=load_slopes.dtype), lower=True)
+        gain_slopes = predicted.reading_slopes[LOAD_SIZE:] / scale
+        projected = gain_slopes - (gain_slopes @ load_slopes.T) @ lapack.cho_solve((root, True), load_slopes)
+        sheet_slopes = sheet.coat_slopes(contact[:, :LOAD_SIZE], gain, near) / scale
+        return modes, projected @ gain_slopes.T, projected @ sheet_slopes.T
 
-    modes, normal, towards = jax.lax.map(told, places)
-    whole = jnp.eye(size, dtype=normal.dtype).at[modes[:, :, None], modes[:, None]].add(normal)
-    right = jnp.zeros((size, towards.shape[-1]), towards.dtype).at[modes].add(towards)
-    found: Array = lapack.cho_solve((lapack.cholesky(whole, lower=True), True), right)
+    modes, normal, right_side = jax.lax.map(normal_equations, places)
+    matrix = jnp.eye(size, dtype=normal.dtype).at[modes[:, :, None], modes[:, None]].add(normal)
+    right_side = jnp.zeros((size, right_side.shape[-1]), right_side.dtype).at[modes].add(right_side)
+    found: Array = lapack.cho_solve((lapack.cholesky(matrix, lower=True), True), right_side)
     return found

@@ -1,4 +1,4 @@
-"""The gain of the contact layer over the sheet: what is known of it beforehand, and what contacts have told of it.
+"""The gain of the contact layer over the sheet: its prior, and what is learned of it from contacts.
 
 The model of a contact errs: tips are not Gaussian, and the layer of a skin may follow another law. During a press such
 an error is the same in all frames, and looks like another gain there; the next press brings another error. So the gain
@@ -22,23 +22,23 @@ from ...contacts.loads.sheet import AbstractGain
 from ...imaging.noise import InverseError
 from ...model.gaussian_field import field_bumps, field_nodes, field_norm
 
-# Difference within which numbers of two fields count as equal, relative to the length of the field.
-SAME = 1e-5
-# Variances of the effect of a press that are considered, in those of the gain before any contact; and that below which
-# they are about as probable as none before any press. Larger ones are the less probable the larger they are.
+# Relative tolerance within which two fields count as equal; of places, relative to the length of the field.
+FIELD_RTOL = 1e-5
+# Variances of the effect of a press in the bank of filters, over that of the gain before any contact; and the variance
+# below which they are about as probable as zero before any press. Larger ones are less probable the larger they are.
 PRESS_VARIANCES = np.array([0.0, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
-USUAL_VARIANCE = 0.03
-# Largest variance of the effect of a press, in those of the gain before any contact, with which a contact is followed.
+TYPICAL_VARIANCE = 0.03
+# Largest variance of the effect of a press in the filter of contacts, over that of the gain before any contact.
 # An effect may have any shape, and one that is odd about the contact looks like another place; those of tips are mostly
 # even. With 10 in place of 0.1 places on the second simulator err twice as much. What is left out is in the error of
 # the force (`consider_covariance`).
-MOST_EXPLAINED = 0.1
-# Least share of the variance of a direction of the gain that a press takes away, for the direction to count.
-LEAST_TOLD = 1e-4
-# Least share that it leaves: rounding.
-TINY = 1e-9
-# Probability of a press that is like none of these: it says no more than this against any of them.
-OUTLIER = 1e-3
+MAX_FILTER_VARIANCE = 0.1
+# Smallest share of the variance of a direction of the gain that a press must take away for the direction to count.
+MIN_LEARNED_SHARE = 1e-4
+# Smallest share of the variance that a press leaves: less is rounding.
+MIN_REMAINING_SHARE = 1e-9
+# Probability of an outlier, a press of none of these variances: it bounds what one press says against any of them.
+OUTLIER_PROBABILITY = 1e-3
 
 
 class GainField(eqx.Module):
@@ -91,8 +91,8 @@ class GainField(eqx.Module):
 
         What the mesh errs by looks like a field of gain with the covariance of that of the layer.
         """
-        of_mesh = np.eye(len(self.places))[:, 1:] * (self.mesh_error / self.deviation if self.deviation else 0.0)
-        return np.concatenate([self.sheet_error, of_mesh], 1)
+        mesh_errors = np.eye(len(self.places))[:, 1:] * (self.mesh_error / self.deviation if self.deviation else 0.0)
+        return np.concatenate([self.sheet_error, mesh_errors], 1)
 
     def require_same(self, other: "GainField") -> None:
         """Refuse what was learned under another field.
@@ -100,10 +100,10 @@ class GainField(eqx.Module):
         Raises:
             InverseError: if places or deviations differ.
         """
-        near = SAME * self.length
-        same = self.places.shape == other.places.shape and np.allclose(self.places[1:], other.places[1:], 0, near)
-        mine, its = ([field.length, field.level, field.deviation, field.norm] for field in (self, other))
-        if not (same and np.allclose(mine, its, rtol=SAME)):
+        tolerance = FIELD_RTOL * self.length
+        same = self.places.shape == other.places.shape and np.allclose(self.places[1:], other.places[1:], 0, tolerance)
+        own, others = ([field.length, field.level, field.deviation, field.norm] for field in (self, other))
+        if not (same and np.allclose(own, others, rtol=FIELD_RTOL)):
             raise InverseError(
                 "the gain of the contact layer was learned on another sheet or under other settings; learn it again"
             )
@@ -139,7 +139,7 @@ class LearnedLayer(AbstractGain):
     ) -> "LearnedLayer":
         """A normal distribution, of which nothing is known how far presses differ from it."""
         count = len(PRESS_VARIANCES)
-        evidence = -np.log1p(PRESS_VARIANCES / USUAL_VARIANCE)
+        evidence = -np.log1p(PRESS_VARIANCES / TYPICAL_VARIANCE)
         return cls(field, np.tile(mean, (count, 1)), np.tile(covariance, (count, 1, 1)), evidence, contacts)
 
     @classmethod
@@ -166,8 +166,8 @@ class LearnedLayer(AbstractGain):
     @property
     def covariance(self) -> Float[np.ndarray, "g g"]:
         """Covariance of the modes: that which the variances have on average, and that of their means."""
-        probabilities, apart = self.probabilities, self.means - self.mean
-        found = np.tensordot(probabilities, self.covariances, 1) + (apart.T * probabilities) @ apart
+        probabilities, deviations = self.probabilities, self.means - self.mean
+        found = np.tensordot(probabilities, self.covariances, 1) + (deviations.T * probabilities) @ deviations
         return np.asarray(0.5 * (found + found.T))
 
     @property
@@ -177,13 +177,13 @@ class LearnedLayer(AbstractGain):
 
     @property
     def before_press(self) -> Float[np.ndarray, "g g"]:
-        """Covariance of the gain with which a contact begins: of the effect of the press at most `MOST_EXPLAINED`."""
-        return self.covariance + min(self.press_variance, MOST_EXPLAINED) * np.eye(len(self.field.places))
+        """Covariance of the gain under a new contact, with at most `MAX_FILTER_VARIANCE` of the effect of the press."""
+        return self.covariance + min(self.press_variance, MAX_FILTER_VARIANCE) * np.eye(len(self.field.places))
 
     @property
     def unexplained(self) -> float:
-        """Variance of the effect of a press beyond that with which a contact begins."""
-        return max(self.press_variance - MOST_EXPLAINED, 0.0)
+        """Variance of the effect of a press beyond `MAX_FILTER_VARIANCE`, which the filter leaves out."""
+        return max(self.press_variance - MAX_FILTER_VARIANCE, 0.0)
 
     @property
     def true_covariance(self) -> Float[np.ndarray, "g g"]:
@@ -195,8 +195,8 @@ class LearnedLayer(AbstractGain):
         in Control Systems 3).
         """
         covariance, errors = self.covariance, self.field.errors()
-        moved = errors - covariance @ errors
-        return np.asarray(covariance + moved @ moved.T)
+        shift = errors - covariance @ errors
+        return np.asarray(covariance + shift @ shift.T)
 
     def told(
         self, gain: Float[Array | np.ndarray, " g"], covariance: Float[Array | np.ndarray, "n n"], contacts: int
@@ -212,22 +212,23 @@ class LearnedLayer(AbstractGain):
             covariance: (n, n), which ends with that of this gain (g, g).
             contacts: number of contacts of the press.
         """
-        own = np.asarray(covariance, float)[-len(gain) :, -len(gain) :]
-        # x' U x = 1 and x' C x = share of the variance that is left, with the covariances U before and C after
-        left, along = eigh(0.5 * (own + own.T), self.before_press, subset_by_value=(-np.inf, 1 - LEAST_TOLD))
-        left, mean = np.maximum(left, TINY), self.mean
-        seen = along.T @ mean + along.T @ (np.asarray(gain, float) - mean) / (1 - left)
-        towards = self.covariances @ along
-        effects = PRESS_VARIANCES[:, None, None] * (along.T @ along)
-        root = np.linalg.cholesky(along.T @ towards + effects + np.diag(left / (1 - left)))
-        right = np.concatenate([towards.mT, (seen - self.means @ along)[..., None]], -1)
-        share, surprise = np.split(np.linalg.solve(root, right), [-1], -1)
-        spread = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
+        after = np.asarray(covariance, float)[-len(gain) :, -len(gain) :]
+        after, interval = 0.5 * (after + after.T), (-np.inf, 1 - MIN_LEARNED_SHARE)
+        # x' U x = 1 and x' C x = share of the variance that remains, with the covariances U before and C after
+        remaining, directions = eigh(after, self.before_press, subset_by_value=interval)
+        remaining, mean = np.maximum(remaining, MIN_REMAINING_SHARE), self.mean
+        measured = directions.T @ mean + directions.T @ (np.asarray(gain, float) - mean) / (1 - remaining)
+        cross = self.covariances @ directions
+        effects = PRESS_VARIANCES[:, None, None] * (directions.T @ directions)
+        root = np.linalg.cholesky(directions.T @ cross + effects + np.diag(remaining / (1 - remaining)))
+        right_side = np.concatenate([cross.mT, (measured - self.means @ directions)[..., None]], -1)
+        whitened_cross, innovation = np.split(np.linalg.solve(root, right_side), [-1], -1)
+        log_volume = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
         return replace(
             self,
-            means=self.means + (share.mT @ surprise)[..., 0],
-            covariances=self.covariances - share.mT @ share,
-            evidence=self.evidence + _bounded(-0.5 * (surprise**2).sum((1, 2)) - spread),
+            means=self.means + (whitened_cross.mT @ innovation)[..., 0],
+            covariances=self.covariances - whitened_cross.mT @ whitened_cross,
+            evidence=self.evidence + _bound_evidence(-0.5 * (innovation**2).sum((1, 2)) - log_volume),
             contacts=self.contacts + contacts,
         )
 
@@ -264,6 +265,6 @@ class LearnedLayer(AbstractGain):
         return replace(LearnedLayer.unknown(self.field), contacts=self.contacts, evidence=self.evidence)
 
 
-def _bounded(evidence: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
-    """Logs of probabilities of a press, over that of the most probable variance, which one press cannot rule out."""
-    return np.asarray(np.logaddexp(evidence - evidence.max(), np.log(OUTLIER)))
+def _bound_evidence(evidence: Float[np.ndarray, " v"]) -> Float[np.ndarray, " v"]:
+    """Logs of probabilities of a press over that of the most probable variance, bounded by that of an outlier."""
+    return np.asarray(np.logaddexp(evidence - evidence.max(), np.log(OUTLIER_PROBABILITY)))

@@ -52,10 +52,10 @@ class Reanalysis(eqx.Module):
     pairs: Int[Array, "p 2"]
     mixing: Float[Array, "p r"]
 
-    def beyond(
+    def nonlinear_part(
         self, elements: Int[Array, " e"], unknowns: Int[Array, " m"], change: Float[Array, " e"]
-    ) -> "BeyondFirstOrder":
-        """Readings of the changed sheet less those of the untouched one, less the first order of this difference.
+    ) -> "NonlinearPart":
+        """Nonlinear part of the change of the readings: the change less its first order.
 
         Args:
             elements: that change. One that occurs twice has a change of zero once.
@@ -63,19 +63,19 @@ class Reanalysis(eqx.Module):
                 One may occur twice.
             change: of the conductivity of each element, S.
         """
-        place, inside, y, after = self._solved(elements, unknowns, change)
+        place, inside, y, after = self._solve_locally(elements, unknowns, change)
         own, before = jnp.where(inside, change, 0), self.potential[unknowns]
         untouched = self._products(self.slopes[elements], self.potential[self.dofs[elements]])
         first, second = self.pairs.T
         moved = -(before.T @ y)[first, second] + untouched @ own
         products = self._products(self.slopes[elements], after[place])
-        return BeyondFirstOrder(moved @ self.mixing, inside, products - untouched)
+        return NonlinearPart(moved @ self.mixing, inside, products - untouched)
 
-    def _solved(
+    def _solve_locally(
         self, elements: Int[Array, " e"], unknowns: Int[Array, " m"], change: Float[Array, " e"]
     ) -> tuple[Int[Array, "e k"], Bool[Array, " e"], Float[Array, "m electrodes"], Float[Array, "n electrodes"]]:
-        """Which of the unknowns each element has (m: another one); whether it has no other; Y; and U with a row of
-        zeros more."""
+        """Solve the changed sheet among the unknowns: rows of each element's unknowns (m: none of these); whether they
+        hold all of its unknowns; Y; and U with a row of zeros more."""
         dofs, slopes, size = self.dofs[elements], self.slopes[elements], len(unknowns)
         place = jnp.full(len(self.green), size).at[unknowns].set(jnp.arange(size))[dofs]
         inside = jnp.all(place < size, 1)
@@ -90,8 +90,11 @@ class Reanalysis(eqx.Module):
     def potential_after(
         self, elements: Int[Array, " e"], unknowns: Int[Array, " m"], change: Float[Array, " e"]
     ) -> Float[Array, "n electrodes"]:
-        """Potentials of unit currents into the electrodes after a change, as for `beyond`, on the whole sheet, ohm."""
-        _, _, y, _ = self._solved(elements, unknowns, change)
+        """Potentials of unit currents into the electrodes after a change, on the whole sheet, ohm.
+
+        Arguments are as for `nonlinear_part`.
+        """
+        _, _, y, _ = self._solve_locally(elements, unknowns, change)
         return self.potential - self.green[:, unknowns] @ y
 
     @verb
@@ -109,14 +112,14 @@ class Reanalysis(eqx.Module):
         first, second = self.pairs.T
         return jnp.sum(fields[:, first] * fields[:, second], 0)
 
-    def beyond_slopes(self, found: "BeyondFirstOrder", directions: Float[Array, "d e"]) -> Float[Array, "d r"]:
-        """Derivatives of the readings of `beyond` with respect to changes of the elements, by the adjoint identity."""
+    def nonlinear_slopes(self, found: "NonlinearPart", directions: Float[Array, "d e"]) -> Float[Array, "d r"]:
+        """Derivatives of `NonlinearPart.readings` along changes of the elements, by the adjoint identity."""
         own = jnp.where(found.inside, directions, 0)
         return -(own @ found.products.T) @ self.mixing
 
 
-class BeyondFirstOrder(NamedTuple):
-    """What a change of some elements does beyond the first order.
+class NonlinearPart(NamedTuple):
+    """Nonlinear part of the change of readings by a change of some elements.
 
     | meaning                                                                  | shape     |
     |--------------------------------------------------------------------------|-----------|

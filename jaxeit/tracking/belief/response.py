@@ -1,4 +1,4 @@
-"""What frames and pads show of contacts, with derivatives.
+"""The measurement model of contacts: readings and pad forces, with derivatives.
 
 Contacts are loads, which add as pressure; the law of the contact layer turns pressure times gain into conductivity. The
 first order of the readings is that of an image on a fine mesh, what is beyond it is solved anew on a coarse mesh under
@@ -21,16 +21,16 @@ from ...contacts.loads.pressure import line, line_shapes
 from ...effects.material import ContactPiezoresistance
 from .reanalysis import Reanalysis
 
-# Least half length, m: an edge of length zero has no direction.
-SHORTEST = 1e-4
-# Of all loads: from points (n, 2) to their pressure (n,) and its slopes (a, n).
+# Smallest half length, m: an edge of length zero has no direction.
+MIN_HALF_LENGTH = 1e-4
+# Pressure of all loads: from points (n, 2) to their pressure (n,) and its slopes (a, n).
 Pressures = Callable[[Array], tuple[Array, Array]]
 # Half lengths, m, and number of directions of the edges whose neighbours are looked up.
-LENGTHS, ANGLES = (0.015, 0.03), 4
+EDGE_HALF_LENGTHS, EDGE_DIRECTIONS = (0.015, 0.03), 4
 
 
-class Near(NamedTuple):
-    """What lies under and around contacts: elements (e,), their unknowns (m,), and pixels (n,).
+class Neighbourhood(NamedTuple):
+    """Elements (e,), their unknowns (m,), and pixels (n,) under and around contacts.
 
     ``own`` of elements and pixels is false for one that also occurs before, near another contact.
     """
@@ -42,7 +42,7 @@ class Near(NamedTuple):
     own_pixels: Bool[Array, " n"]
 
 
-class Neighbours(eqx.Module):
+class NeighbourTable(eqx.Module):
     """Elements, unknowns and pixels nearest to the middle of each cell of a grid, or to an edge that has its middle
     there, (edges, cells, ...).
 
@@ -56,33 +56,35 @@ class Neighbours(eqx.Module):
     pixels: Int[Array, "edges cells n"]
     shape: tuple[int, int] = eqx.field(static=True)
 
-    def near(self, loads: Float[Array, "K 6"], elements: int, pixels: int) -> Near:
-        """What is near loads, of a mesh of so many elements and an image of so many pixels."""
+    def neighbourhood(self, loads: Float[Array, "K 6"], elements: int, pixels: int) -> Neighbourhood:
+        """Neighbourhood of loads, on a mesh of so many elements and an image of so many pixels."""
         rows, columns = self.shape
         x, y = jnp.floor((loads[:, :2] - self.low) / self.pitch).astype(jnp.int32).T
         cell = jnp.clip(y, 0, rows - 1) * columns + jnp.clip(x, 0, columns - 1)
-        edge = _edge_number(loads[:, 4:])
+        edge = _edge_index(loads[:, 4:])
         under, unknowns, around = (table[edge, cell].ravel() for table in (self.elements, self.unknowns, self.pixels))
         count = len(loads)
-        return Near(under, unknowns, around, _once(under, count, elements), _once(around, count, pixels))
+        return Neighbourhood(
+            under, unknowns, around, _first_occurrence(under, count, elements), _first_occurrence(around, count, pixels)
+        )
 
 
-def half_lengths() -> Float[np.ndarray, "edges 2"]:
-    """Half the edges of `Neighbours`, m: none, then of each length in each direction."""
-    angles = np.pi * np.arange(ANGLES) / ANGLES
+def edge_half_lengths() -> Float[np.ndarray, "edges 2"]:
+    """Half lengths of the edges of `NeighbourTable`, m: zero, then each length in each direction."""
+    angles = np.pi * np.arange(EDGE_DIRECTIONS) / EDGE_DIRECTIONS
     along = np.stack([np.cos(angles), np.sin(angles)], 1)
-    return np.concatenate([np.zeros((1, 2)), *(length * along for length in LENGTHS)])
+    return np.concatenate([np.zeros((1, 2)), *(length * along for length in EDGE_HALF_LENGTHS)])
 
 
-def _edge_number(half: Float[Array, "K 2"]) -> Int[Array, " K"]:
-    """The row of `half_lengths` that is nearest to each half edge, whose sign does not matter."""
-    rows = jnp.asarray(half_lengths(), half.dtype)
+def _edge_index(half: Float[Array, "K 2"]) -> Int[Array, " K"]:
+    """The row of `edge_half_lengths` that is nearest to each half edge, whose sign does not matter."""
+    rows = jnp.asarray(edge_half_lengths(), half.dtype)
     squares = [jnp.sum((half[:, None] - sign * rows) ** 2, -1) for sign in (1, -1)]
     nearest: Array = jnp.argmin(jnp.minimum(*squares), 1)
     return nearest
 
 
-def _once(indices: Int[Array, " e"], lists: int, size: int) -> Bool[Array, " e"]:
+def _first_occurrence(indices: Int[Array, " e"], lists: int, size: int) -> Bool[Array, " e"]:
     """Which indices no earlier list holds."""
     rows, taken, out = indices.reshape(lists, -1), jnp.zeros(size, bool), []
     for row in rows:
@@ -91,8 +93,8 @@ def _once(indices: Int[Array, " e"], lists: int, size: int) -> Bool[Array, " e"]
     return jnp.concatenate(out)
 
 
-class Shown(NamedTuple):
-    """What contacts show, and its derivatives with respect to the numbers of contacts and the modes that are asked for.
+class PredictedMeasurement(NamedTuple):
+    """Predicted readings and pad forces, with slopes in the parameters of loads and in some modes of the gain.
 
     | meaning                  | shape       | unit |
     |--------------------------|-------------|------|
@@ -113,8 +115,8 @@ class LoadedSheet(eqx.Module):
 
     | meaning                                                                  | shape            | unit |
     |--------------------------------------------------------------------------|------------------|------|
-    | sheet: readings of a changed sheet beyond the first order                |                  |      |
-    | neighbours: of places                                                    |                  |      |
+    | sheet: nonlinear part of the change of readings                          |                  |      |
+    | neighbours: of positions                                                 |                  |      |
     | sigma: of the untouched sheet, on the coarse mesh                        | (elements,)      | S    |
     | points, weights: of the elements                                         | (elements, q, 2), (q,) | m |
     | modes: of the log gain of each element; the first is the level           | (elements, g)    | 1    |
@@ -123,12 +125,12 @@ class LoadedSheet(eqx.Module):
     | pixel_modes: of the log gain of each                                     | (p, g)           | 1    |
     | pad_area: area of each pad in each pixel                                 | (p, pads)        | m^2  |
     | coat: modes of the log conductivity that is not known, on the coarse mesh | (elements, c)   | 1    |
-    | by_coat: slopes of the readings of the untouched sheet in these          | (c, r)           | 1    |
+    | untouched_slopes: of the readings of the untouched sheet in these        | (c, r)           | 1    |
     | law: factor of conductivity by pressure                                  |                  |      |
     """
 
     sheet: Reanalysis
-    neighbours: Neighbours
+    neighbours: NeighbourTable
     sigma: Float[Array, " elements"]
     points: Float[Array, "elements q 2"]
     weights: Float[Array, " q"]
@@ -138,121 +140,123 @@ class LoadedSheet(eqx.Module):
     pixel_modes: Float[Array, "p g"]
     pad_area: Float[Array, "p pads"]
     coat: Float[Array, "elements c"]
-    by_coat: Float[Array, "c r"]
+    untouched_slopes: Float[Array, "c r"]
     law: ContactPiezoresistance
 
-    def coat_slopes(self, contacts: Float[Array, "K 6"], gain: Float[Array, " g"], near: Near) -> Float[Array, "c r"]:
-        """Slopes of what readings show of contacts in the modes of the coat.
+    def coat_slopes(
+        self, contacts: Float[Array, "K 6"], gain: Float[Array, " g"], near: Neighbourhood
+    ) -> Float[Array, "c r"]:
+        """Slopes of the readings of contacts in the modes of the coat.
 
         A frame is a difference to the untouched sheet, so that these are the slopes of the loaded sheet less those of
         the untouched one, both on the coarse mesh.
         """
         pressures = partial(_pressures, contacts.astype(self.points.dtype), shapes=False)
-        change, _ = self._changes(pressures, gain, jnp.zeros(0, jnp.int32), near)
+        change, _ = self._element_changes(pressures, gain, jnp.zeros(0, jnp.int32), near)
         after = self.sheet.potential_after(near.elements, near.unknowns, change)
         loaded = self.sigma.at[near.elements].add(change)
-        return (self.sheet.slopes_along(loaded * self.coat.T, after) - self.by_coat).astype(contacts.dtype)
+        return (self.sheet.slopes_along(loaded * self.coat.T, after) - self.untouched_slopes).astype(contacts.dtype)
 
-    def near(self, contacts: Float[Array, "K 6"]) -> Near:
-        """What is near contacts."""
-        return self.neighbours.near(contacts.astype(self.points.dtype), len(self.sigma), len(self.pixels))
+    def neighbourhood(self, contacts: Float[Array, "K 6"]) -> Neighbourhood:
+        """Elements, unknowns and pixels under and around contacts."""
+        return self.neighbours.neighbourhood(contacts.astype(self.points.dtype), len(self.sigma), len(self.pixels))
 
-    def on_pads(self, contacts: Float[Array, "K 6"], near: Near) -> Float[Array, "K pads"]:
+    def pad_loads(self, contacts: Float[Array, "K 6"], near: Neighbourhood) -> Float[Array, "K pads"]:
         """Force of each contact on each pad, N."""
         places, area = self.pixels[near.pixels], jnp.where(near.own_pixels[:, None], self.pad_area[near.pixels], 0)
         pressures = jax.vmap(load_pressure, (0, None))(contacts.astype(self.points.dtype), places)
         return (pressures @ area).astype(contacts.dtype)
 
-    def signals(self, contacts: Float[Array, "K 6"], gain: Float[Array, " g"], near: Near) -> Float[Array, "K r"]:
-        """What each contact by itself shows in the readings, to first order."""
+    def signals(
+        self, contacts: Float[Array, "K 6"], gain: Float[Array, " g"], near: Neighbourhood
+    ) -> Float[Array, "K r"]:
+        """Readings of each single contact, to first order."""
         pixels, own = near.pixels, near.own_pixels
         pressures = jax.vmap(load_pressure, (0, None))(contacts.astype(self.points.dtype), self.pixels[pixels])
         factor = jnp.exp(self.pixel_modes[pixels] @ gain.astype(self.pixel_modes.dtype))
-        relative, _, _ = self._conducting(jnp.where(own, pressures, 0), factor)
+        relative, _, _ = self._conductivity_change(jnp.where(own, pressures, 0), factor)
         return (relative @ self.pixel_response[pixels]).astype(contacts.dtype)
 
-    def shown(
+    def predict_measurement(
         self,
         contacts: Float[Array, "K 6"],
         gain: Float[Array, " g"],
         modes: Int[Array, " b"],
-        near: Near,
+        near: Neighbourhood,
         shapes: bool = False,
-    ) -> Shown:
-        """What frames and pads show of contacts, with slopes in their numbers and in some modes of the gain.
+    ) -> PredictedMeasurement:
+        """Predict readings and pad forces of contacts, with slopes in their loads and in some modes of the gain.
 
         Args:
-            shapes: after the slopes in the numbers of a contact come those in its shape (`pressure.line_shapes`).
+            shapes: after the slopes in the load of a contact come those in its shape (`pressure.line_shapes`).
         """
         pressures = partial(_pressures, contacts.astype(self.points.dtype), shapes=shapes)
-        pads, pixels = self._first_order(pressures, gain, modes, near)
-        change, slopes = self._changes(pressures, gain, modes, near)
-        found = self.sheet.beyond(near.elements, near.unknowns, change)
-        beyond = self.sheet.beyond_slopes(found, slopes)
-        readings, first = pixels
+        (force, force_slopes), (linear, linear_slopes) = self._first_order(pressures, gain, modes, near)
+        change, slopes = self._element_changes(pressures, gain, modes, near)
+        nonlinear = self.sheet.nonlinear_part(near.elements, near.unknowns, change)
+        nonlinear_slopes = self.sheet.nonlinear_slopes(nonlinear, slopes)
         exact = contacts.dtype
-        force, pad_slopes = pads
-        still = jnp.zeros((len(modes), len(force)), exact)  # pads feel no gain
-        return Shown(
-            (readings + found.readings).astype(exact),
+        gain_slopes = jnp.zeros((len(modes), len(force)), exact)  # forces do not depend on the gain
+        return PredictedMeasurement(
+            (linear + nonlinear.readings).astype(exact),
             force.astype(exact),
-            (first + beyond).astype(exact),
-            jnp.concatenate([pad_slopes.astype(exact), still]),
+            (linear_slopes + nonlinear_slopes).astype(exact),
+            jnp.concatenate([force_slopes.astype(exact), gain_slopes]),
         )
 
     def _first_order(
-        self, pressures: Pressures, gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
+        self, pressures: Pressures, gain: Float[Array, " g"], modes: Int[Array, " b"], near: Neighbourhood
     ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         """Forces on pads and their slopes (a, pads); readings of the image and their slopes (a, r)."""
         pixels, table = near.pixels, self.pixel_modes[near.pixels]
         pressure, slopes = (jnp.where(near.own_pixels, part, 0) for part in pressures(self.pixels[pixels]))
         area, response = self.pad_area[pixels], self.pixel_response[pixels]
-        relative, along, by_gain = self._conducting(pressure, jnp.exp(table @ gain.astype(table.dtype)))
+        relative, along, by_gain = self._conductivity_change(pressure, jnp.exp(table @ gain.astype(table.dtype)))
         moved = jnp.concatenate([along * slopes, by_gain * table[:, modes].T])
         return (pressure @ area, slopes @ area), (relative @ response, moved @ response)
 
-    def _changes(
-        self, pressures: Pressures, gain: Float[Array, " g"], modes: Int[Array, " b"], near: Near
+    def _element_changes(
+        self, pressures: Pressures, gain: Float[Array, " g"], modes: Int[Array, " b"], near: Neighbourhood
     ) -> tuple[Float[Array, " e"], Float[Array, "a e"]]:
         """Change of conductivity of the elements, S, and its slopes."""
         elements, table = near.elements, self.modes[near.elements]
         points = self.points[elements]
         pressure, slopes = pressures(points.reshape(-1, 2))
         factor = jnp.exp(table @ gain.astype(table.dtype))
-        relative, along, by_gain = self._conducting(pressure.reshape(points.shape[:2]), factor[:, None])
+        relative, along, by_gain = self._conductivity_change(pressure.reshape(points.shape[:2]), factor[:, None])
         scale = jnp.where(near.own_elements, self.sigma[elements], 0)
         by_load = jnp.sum(along * self.weights * slopes.reshape(-1, *points.shape[:2]), 2)
         by_mode = (by_gain @ self.weights) * table[:, modes].T
         return scale * (relative @ self.weights), scale * jnp.concatenate([by_load, by_mode])
 
-    def _conducting(
+    def _conductivity_change(
         self, pressure: Float[Array, "..."], gain: Float[Array, "..."]
     ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
         """Relative change of conductivity under pressure times gain, and its slopes in pressure and in log gain."""
         law = jax.tree.map(lambda leaf: leaf.astype(pressure.dtype), self.law)
-        felt = pressure * gain
-        factor, slope = jax.jvp(law.factor, (felt,), (jnp.ones_like(felt),))
-        return factor - 1, slope * gain, slope * felt
+        effective = pressure * gain
+        factor, slope = jax.jvp(law.factor, (effective,), (jnp.ones_like(effective),))
+        return factor - 1, slope * gain, slope * effective
 
 
 def _pressures(
     loads: Float[Array, "K 6"], points: Float[Array, "n 2"], shapes: bool
 ) -> tuple[Float[Array, " n"], Float[Array, "a n"]]:
-    """Pressure of all loads at points, Pa, and its slopes in the six numbers of each, and in its shape if asked for."""
-    values, slopes = zip(*(_with_slopes(load, points, shapes) for load in loads), strict=True)
+    """Pressure of all loads at points, Pa, and its slopes in the parameters of each, and in its shape if asked for."""
+    values, slopes = zip(*(_pressure_and_slopes(load, points, shapes) for load in loads), strict=True)
     return jnp.sum(jnp.stack(values), 0), jnp.concatenate(slopes)
 
 
-def _with_slopes(
+def _pressure_and_slopes(
     load: Float[Array, "6"], points: Float[Array, "n 2"], shapes: bool
 ) -> tuple[Float[Array, " n"], Float[Array, "a n"]]:
     value, slopes = load_slopes(load, points)
-    return value, jnp.concatenate([slopes, line_shapes(load, points, SHORTEST).T]) if shapes else slopes
+    return value, jnp.concatenate([slopes, line_shapes(load, points, MIN_HALF_LENGTH).T]) if shapes else slopes
 
 
 def load_slopes(load: Float[Array, "6"], points: Float[Array, "n 2"]) -> tuple[Float[Array, " n"], Float[Array, "6 n"]]:
-    """`load_pressure` and its slopes in the numbers of the load, by hand, which takes a third of the time."""
-    width, half = jnp.exp(load[2]), jnp.sqrt(load[4:] @ load[4:] + SHORTEST**2)
+    """`load_pressure` and its slopes in the parameters of the load, by hand, which takes a third of the time."""
+    width, half = jnp.exp(load[2]), jnp.sqrt(load[4:] @ load[4:] + MIN_HALF_LENGTH**2)
     unit, away = (load[4:] / half)[:, None], points.T - load[:2, None]
     along = jnp.sum(unit * away, 0)
     beside, across = away - along * unit, jnp.sum(away**2, 0) - along**2
@@ -269,5 +273,5 @@ def load_slopes(load: Float[Array, "6"], points: Float[Array, "n 2"]) -> tuple[F
 
 def load_pressure(load: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
     """Pressure at points, Pa, of a load (x, y, log width, log force, half length along x and y)."""
-    found: Array = line(load, points, SHORTEST)
+    found: Array = line(load, points, MIN_HALF_LENGTH)
     return found
