@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from .._compile import require_known
-from ..contacts.loads.learned.model_error import fitted_model_error
+from ..contacts.loads.learned.model_error import select_model_error
 from ..imaging.noise import InverseError, require_real
 from ..kinds import require_unmasked
 from .belief.filter import Pads
@@ -30,7 +30,7 @@ def fit_model_error(
 
     Mesh, contact layer and loads of a real skin are not those of the model. A tracker that takes the model for better
     than it is explains what the model leaves of a press by further contacts. Here one contact is fitted to each frame
-    under each of some model errors, from that of the settings on (`fitted_model_error`). Frames for which no such fit
+    under each of some model errors, from that of the settings on (`select_model_error`). Frames for which no such fit
     converges are left out.
 
     Args:
@@ -54,7 +54,7 @@ def fit_model_error(
         return _evidence(tracker_with(error), frame, pads)
 
     evidences = [partial(evidence, *one) for one in observations]
-    return tracker_with(fitted_model_error(evidences, tracker.settings.loads.model_error))
+    return tracker_with(select_model_error(evidences, tracker.settings.loads.model_error))
 
 
 def press_evidence(

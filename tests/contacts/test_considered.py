@@ -9,9 +9,9 @@ from benchmarks.bench_loads import INSIDE, TIP_SPREAD, shaped
 from benchmarks.problems import pressed, uneven
 from calib.calibration.localisation.load_windows import LOAD_FIDELITY
 from jaxeit.contacts import prepare_loads
-from jaxeit.contacts.loads.considered import Known, inverse_of, mean_errors
+from jaxeit.contacts.loads.considered import Linearisation, inverse_of, mean_errors
 from jaxeit.contacts.loads.pressure import MAX_LOADS, Form, even_moments, shape_directions, spot, tilt_directions
-from jaxeit.contacts.loads.sheet import Unknowns
+from jaxeit.contacts.loads.sheet import Sensitivities
 from tests.compiled import compiled
 
 READINGS, FREE, SHAPES, TILTS = 12, 3, 6, 2
@@ -34,8 +34,8 @@ def test_mean_errors_are_those_of_simulated_fits():
         bent = np.concatenate([shapes, tilts], 1) @ (factors * rng.normal(size=SHAPES + TILTS))
         y = loads @ true + bent + rng.normal(size=READINGS)
         found = believed @ white.T @ np.linalg.solve(root, y)
-        end = Unknowns(loads @ found, shapes, shapes, tilts, every, elongation, np.zeros((READINGS, 3)))
-        mean, square = mean_errors(Known(y, end, root, found, np.eye(FREE)), free, FACTORS)
+        end = Sensitivities(loads @ found, shapes, shapes, tilts, every, elongation, np.zeros((READINGS, 3)))
+        mean, square = mean_errors(Linearisation(y, end, root, found, np.eye(FREE)), free, FACTORS)
         stated.append(square)
         seen.append(np.outer(true - found, true - found))
         left.append(np.outer(true - found - mean, true - found - mean))
@@ -53,8 +53,8 @@ def test_without_larger_shapes_a_fit_at_rest_keeps_its_covariance():
     believed = np.linalg.inv(white.T @ white + np.eye(FREE))
     found = believed @ white.T @ np.linalg.solve(root, y)
     tilts, elongation, law = (np.zeros((READINGS, n)) for n in (0, 2, 3))
-    end = Unknowns(loads @ found, shapes, shapes, tilts, loads, elongation, law)
-    mean, stated = mean_errors(Known(y, end, root, found, np.eye(FREE)), np.ones(FREE, bool), np.ones(1))
+    end = Sensitivities(loads @ found, shapes, shapes, tilts, loads, elongation, law)
+    mean, stated = mean_errors(Linearisation(y, end, root, found, np.eye(FREE)), np.ones(FREE, bool), np.ones(1))
     np.testing.assert_allclose(stated, believed, atol=1e-12)
     np.testing.assert_allclose(mean, 0, atol=1e-12)
 

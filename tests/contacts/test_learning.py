@@ -12,7 +12,7 @@ from jaxeit.contacts import ForceLaw, LoadKind, LoadSettings, learn_loads, prepa
 from jaxeit.contacts.loads.comparison import load_shape
 from jaxeit.contacts.loads.fits import Fit, FrameFits
 from jaxeit.contacts.loads.learned import learning
-from jaxeit.contacts.loads.learned.model_error import LAST, STEP, fitted_model_error
+from jaxeit.contacts.loads.learned.model_error import ERROR_RATIO, MAX_ERROR, select_model_error
 from jaxeit.contacts.loads.search import FrameSearch
 from jaxeit.contacts.loads.sheet import scaled_law
 from jaxeit.imaging import InverseError
@@ -103,7 +103,7 @@ def test_forces_are_told_by_the_law_that_single_presses_follow(monkeypatch):
     slopes = rng.uniform([1.0, -1.1, -2.0], [1.5, -0.9, -0.4], (64, 3))
     missed = slopes @ truth + 0.07 * rng.normal(size=64)
     missed[5] += np.log(5)
-    law = learning.regressed_force_law(missed, np.full(64, 0.14**2), slopes)
+    law = learning.fit_force_law(missed, np.full(64, 0.14**2), slopes)
     off = slopes @ (np.array(law.logs) - truth)
     assert np.abs(off).max() < 0.06
     stated = np.sqrt(np.einsum("ni,ij,nj->n", slopes, np.array(law.covariance), slopes))
@@ -142,7 +142,7 @@ def test_a_law_of_forces_is_three_finite_logs(wrong):
 def test_slopes_in_the_law_are_those_of_the_forward_map(ready, loads):
     """Against differences of the readings under laws that differ a little."""
     sheet, (theta, forms) = ready[0].belief.sheet, rows(*loads)
-    slopes = np.asarray(compiled(sheet.unknowns, theta, forms).law)
+    slopes = np.asarray(compiled(sheet.sensitivities, theta, forms).law)
     step, parts = 1e-4, [float(part) for part in jax.tree.leaves(sheet.law)]
     for k in range(3):
         up, down = (
@@ -168,7 +168,7 @@ def test_a_texture_is_an_error_that_a_frame_does_not_tell(ready):
     sheet = {"noise": noise, "sigma": fitter.belief.sheet.sigma}
     rough = prepare_loads(fitter.belief.sheet.model, LoadSettings(texture=0.2), **sheet)
     theta, forms = rows(SPOT)
-    plain, known = (compiled(one.belief.sheet.unknowns, theta, forms) for one in (fitter, rough))
+    plain, known = (compiled(one.belief.sheet.sensitivities, theta, forms) for one in (fitter, rough))
     np.testing.assert_allclose(known.value, plain.value, rtol=1e-12)
     added = np.asarray(known.nuisances) @ np.asarray(known.nuisances).T
     added -= np.asarray(plain.nuisances) @ np.asarray(plain.nuisances).T
@@ -200,16 +200,16 @@ def test_the_error_is_that_which_nine_of_ten_frames_stay_below():
     def frame(own):
         return lambda error: -100 * np.log(error / own) ** 2
 
-    own = 0.01 * STEP ** np.array([0, 1, 1, 2, 2, 2, 3, 3, 4, 6])
-    assert fitted_model_error([frame(one) for one in own], 0.01) == pytest.approx(0.01 * STEP**6)
-    assert fitted_model_error([frame(one) for one in own[:-1]] * 2, 0.01) == pytest.approx(0.01 * STEP**4)
-    assert fitted_model_error([frame(1.0)], 0.01) == pytest.approx(LAST, rel=0.4)
-    assert fitted_model_error([frame(1e-9)], 0.0) == pytest.approx(1e-3)  # no error at all cannot be tried
+    own = 0.01 * ERROR_RATIO ** np.array([0, 1, 1, 2, 2, 2, 3, 3, 4, 6])
+    assert select_model_error([frame(one) for one in own], 0.01) == pytest.approx(0.01 * ERROR_RATIO**6)
+    assert select_model_error([frame(one) for one in own[:-1]] * 2, 0.01) == pytest.approx(0.01 * ERROR_RATIO**4)
+    assert select_model_error([frame(1.0)], 0.01) == pytest.approx(MAX_ERROR, rel=0.4)
+    assert select_model_error([frame(1e-9)], 0.0) == pytest.approx(1e-3)  # no error at all cannot be tried
 
 
 def test_frames_of_which_no_fit_converges_tell_no_error():
     with pytest.raises(InverseError, match=r"fitted to 1 of 2 frames, .* frames \[1\]"):
-        fitted_model_error([lambda error: -error, lambda error: -np.inf], 0.01)
+        select_model_error([lambda error: -error, lambda error: -np.inf], 0.01)
 
 
 @pytest.mark.slow
@@ -228,7 +228,7 @@ def test_presses_of_one_force_tell_no_law_of_forces(ready, monkeypatch):
     fitter, frames = ready[0], np.zeros((7, 550))
     monkeypatch.setattr(learning, "prepare_loads", lambda *_, **__: fitter)
     monkeypatch.setattr(
-        learning, "_fitted_law", lambda *_: (np.zeros(3), [Fit(LoadKind.ONE, np.zeros((3, 6)), 0.0, None, None)])
+        learning, "_fit_law", lambda *_: (np.zeros(3), [Fit(LoadKind.ONE, np.zeros((3, 6)), 0.0, None, None)])
     )
     monkeypatch.setattr(learning, "_model_error", lambda *_: (0.01, np.zeros(7)))
     monkeypatch.setattr(learning, "_force_law", lambda *_: ForceLaw(logs=(0.1, 0.0, 0.0)))
@@ -246,7 +246,7 @@ def test_presses_that_tell_nothing_are_not_counted(ready, monkeypatch):
         found = iter(evidences)
         monkeypatch.setattr(learning, "prepare_loads", lambda *_, **__: fitter)
         monkeypatch.setattr(
-            learning, "_fitted_law", lambda *_: (np.zeros(3), [Fit(LoadKind.ONE, np.zeros((3, 6)), 0.0, None, None)])
+            learning, "_fit_law", lambda *_: (np.zeros(3), [Fit(LoadKind.ONE, np.zeros((3, 6)), 0.0, None, None)])
         )
         monkeypatch.setattr(learning, "_force_law", lambda *_: ForceLaw())
         monkeypatch.setattr(learning, "_model_error", lambda *_: (0.01, np.array([*next(found), *np.zeros(5)])))

@@ -27,8 +27,8 @@ def test_an_atom_that_the_slopes_explain_is_no_other_load(atoms):
     starts, other = _starts(atoms), _starts(atoms[3:])
     for seed in range(20):
         left = np.random.default_rng([5, seed]).normal(size=40)
-        fall, load = starts.atom(left, root, slopes)
-        expected = other.atom(left, root, slopes)[0]
+        fall, load = starts.best_atom(left, root, slopes)
+        expected = other.best_atom(left, root, slopes)[0]
         assert fall == pytest.approx(expected)
         assert load[0, 0] >= 0.1  # the place of one of the last three
         assert np.isfinite(load).all()
@@ -38,12 +38,12 @@ def test_no_atom_at_all_changes_nothing(atoms):
     """All in the span of the slopes, or zero: no fall, and no NaN."""
     left = np.random.default_rng(6).normal(size=40)
     for starts, slopes in ((_starts(atoms), atoms.T), (_starts(0 * atoms), None)):
-        fall, load = starts.atom(left, np.eye(40), slopes)
+        fall, load = starts.best_atom(left, np.eye(40), slopes)
         assert fall == 0
         assert np.isfinite(load).all()
 
 
 def test_other_atoms_are_found_as_before(atoms):
-    fall, load = _starts(atoms).atom(3 * atoms[4], np.eye(40))
+    fall, load = _starts(atoms).best_atom(3 * atoms[4], np.eye(40))
     assert fall == pytest.approx(9 * np.sum(atoms[4] ** 2))
     assert load[0, 3] == pytest.approx(-4 + np.log(3))

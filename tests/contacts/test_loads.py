@@ -19,7 +19,7 @@ from jaxeit.contacts.loads.pressure import (
     Form,
     elongations,
     line,
-    padded,
+    pad_rows,
     pressure,
     shape_directions,
     spot,
@@ -90,7 +90,7 @@ def test_a_tip_that_is_no_gaussian_is_one(ready, touch):
     found = fitter(frame, finder(frame))
     assert found.kind is LoadKind.ONE
     assert np.linalg.norm(np.asarray(found.one.position[0]) - touch[1] @ touch[0] / touch[1].sum()) < 0.002
-    apart = eqx.tree_at(lambda f: f.belief.least, fitter, jnp.full(2, 1e-4))
+    apart = eqx.tree_at(lambda f: f.belief.min_separation, fitter, jnp.full(2, 1e-4))
     assert found.probability[LoadKind.ONE] > apart(frame, finder(frame)).probability[LoadKind.ONE]
 
 
@@ -107,7 +107,7 @@ def test_loads_that_saturate_the_sheet_are_told(ready, kind, touch):
     frame = frames_of([touch] * len(TOUCHES), seed=4, spread=0.018)[0][0]
     contacts = finder(frame)
     assert np.asarray(contacts.present).sum() >= 2
-    assert np.exp(fitter.starts.seen(contacts, 2)[0][0, 3]) > 1.3 * touch[1].max()
+    assert np.exp(fitter.starts.strongest(contacts, 2)[0][0, 3]) > 1.3 * touch[1].max()
     found = fitter(frame, contacts)
     assert found.kind is kind
     assert found.best.misfit < 1.4
@@ -123,7 +123,7 @@ def test_three_loads_of_which_two_are_near_are_two(ready):
     for away, kind in (((0.008, 0.07), LoadKind.TWO), ((0.008, 0.016), LoadKind.ONE)):
         places = np.array([0.06, 0.1]) + np.array([[0.0, 0.0], [away[0], 0.0], [away[1], 0.0]])
         three = np.column_stack([places, np.full(3, np.log(0.012)), np.full(3, np.log(20.0))])
-        loads, root = padded(three), np.eye(len(frame.y))
+        loads, root = pad_rows(three), np.eye(len(frame.y))
         curved = np.diag(np.tile([1e6, 1e6, 10.0, 10.0, 0.0, 0.0], MAX_LOADS))  # places to 1 mm
         fits = {of: Fit(of, loads, 0.0, curved, root) for of in (LoadKind.ONE, LoadKind.TWO, LoadKind.MORE)}
         alone, found = log_evidence(frame.belief, fits[LoadKind.MORE]), evidences(frame, fits)
@@ -211,7 +211,7 @@ def test_slopes_are_those_of_the_forward_map(ready, loads, most):
     sheet = ready[0].belief.sheet
     theta, forms = rows(*loads)
     by_jax = jax.jacfwd(lambda flat: sheet.response(flat, forms))(theta).reshape(-1, MAX_LOADS * LOAD_PARAMETERS)
-    known = compiled(sheet.unknowns, theta, forms)
+    known = compiled(sheet.sensitivities, theta, forms)
     np.testing.assert_allclose(
         known.value, compiled(sheet.response, theta, forms), atol=1e-6 * float(jnp.abs(known.value).max())
     )
@@ -227,10 +227,10 @@ def test_what_is_not_known_of_the_coat_moves_the_readings_of_a_load(ready):
     model = fitter.belief.sheet.model
     sheet = prepare_loads(model, noise=noise).belief.sheet
     theta, forms = rows(SPOT)
-    white = jax.jit(lambda sigma: sheet.white(transfer(model, coefficients(model, sigma))))
+    white = jax.jit(lambda sigma: sheet.whiten(transfer(model, coefficients(model, sigma))))
     factor = sheet._pressed(theta, forms) / sheet.sigma
     change = lambda mode: (lambda s: white(s * factor) - white(s))(sheet.sigma * jnp.exp(sheet.coat[:, mode]))  # noqa: E731
-    slopes = compiled(sheet.unknowns, theta, forms).nuisances[:, -sheet.coat.shape[1] :]
+    slopes = compiled(sheet.sensitivities, theta, forms).nuisances[:, -sheet.coat.shape[1] :]
     strongest = int(jnp.argmax(jnp.linalg.norm(slopes, axis=0)))
     seen = change(strongest) - (white(sheet.sigma * factor) - white(sheet.sigma))
     assert np.linalg.norm(seen - slopes[:, strongest]) < 0.25 * np.linalg.norm(seen)
@@ -256,7 +256,7 @@ def test_a_gain_of_which_nothing_is_known_changes_nothing(ready):
         model, noise=noise, sigma=sigma, gain=Gain(lambda points: np.zeros(len(points)), 1.0)
     ).belief.sheet
     theta, forms = rows(SPOT)
-    one, other = (compiled(sheet.unknowns, theta, forms) for sheet in (fitter.belief.sheet, same))
+    one, other = (compiled(sheet.sensitivities, theta, forms) for sheet in (fitter.belief.sheet, same))
     np.testing.assert_allclose(other.value, one.value, atol=1e-9 * float(jnp.abs(one.value).max()))
     errors = [np.asarray(each.nuisances @ each.nuisances.T) for each in (one, other)]
     np.testing.assert_allclose(errors[1], errors[0], atol=1e-9 * np.abs(errors[0]).max())
@@ -269,7 +269,7 @@ def test_a_gain_that_is_even_and_known_is_a_factor_of_the_force(ready):
     even = Gain(lambda points: np.full(len(points), np.log(2.0)), 1.0)
     twice = prepare_loads(model, noise=noise, sigma=sigma, gain=even).belief.sheet
     one, other = (
-        compiled(sheet.unknowns, *rows(SPOT.at[3].add(log)))
+        compiled(sheet.sensitivities, *rows(SPOT.at[3].add(log)))
         for sheet, log in ((fitter.belief.sheet, 0.0), (twice, -np.log(2.0)))
     )
     for name in ("value", "loads", "shapes"):

@@ -206,9 +206,9 @@ def test_a_fit_from_a_proposal_ends_where_a_search_does(ready):
 def test_a_proposal_that_leads_astray_is_not_followed(ready, monkeypatch):
     """Neither outside of its scenes, nor where what it proposes explains nothing."""
     fitter, finder, frames, _ = ready
-    contacts, search, calls = finder(frames[0]), FrameSearch.searched, []
+    contacts, search, calls = finder(frames[0]), FrameSearch.search, []
     searched = fitter(frames[0], contacts)
-    monkeypatch.setattr(FrameSearch, "searched", lambda self: calls.append(self) or search(self))
+    monkeypatch.setattr(FrameSearch, "search", lambda self: calls.append(self) or search(self))
     far = proposed(LoadKind.ONE, [(np.array([0.1, 0.1]), 10.0)], distance=1.5)
     np.testing.assert_array_equal(fitter.refine(frames[0], far, contacts).probability, searched.probability)
     right = proposed(LoadKind.ONE, [(np.array([0.09, 0.12]), 20.0)])

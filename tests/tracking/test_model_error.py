@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from jaxeit.contacts.loads.learned.model_error import STEP
+from jaxeit.contacts.loads.learned.model_error import ERROR_RATIO
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import fit_model_error, model_error, press_evidence
 from jaxeit.tracking.belief.filter import CONTACT_SIZE
@@ -46,7 +46,7 @@ def test_the_error_that_was_made_is_found(tracker, humble, presses):
     rng = np.random.default_rng(5)
     parts = [unit @ (wrong(frame, rng) - frame) for frame in presses], [unit @ frame for frame in presses]
     truth = np.median([np.linalg.norm(error) / np.linalg.norm(signal) for error, signal in zip(*parts, strict=True)])
-    assert truth / STEP < humble.settings.loads.model_error < truth * STEP**2
+    assert truth / ERROR_RATIO < humble.settings.loads.model_error < truth * ERROR_RATIO**2
     assert float(humble.filter.model_error) == pytest.approx(humble.settings.loads.model_error)
     assert humble.field.mesh_error == MESH_ERROR_RATIO * humble.settings.loads.model_error
 

@@ -7,15 +7,16 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from .belief import LoadBelief
-from .considered import Known, inverse_of
-from .pressure import FORMS, free_parameters, padded, padded_forms
-from .programs import Problem, before, fit_loads, unknowns_of
+from .considered import Linearisation, inverse_of
+from .pressure import FORMS, free_parameters, pad_rows, padded_forms
+from .programs import Problem, fit_loads, linearise_prior, sensitivities_of
 from .result import LoadKind
-from .sheet import Unknowns
+from .sheet import Sensitivities
 
-# Half of the fall of chi-square at which a fit ends: one whose errors are those at its start, and the last one.
-TRIAL_FALL, LAST_FALL = 1.0, 0.02
-ASTRAY = 4.0  # chi-square over the number of readings, above which a fit starts elsewhere
+# Predicted fall of half of chi-square at which a fit ends: a trial, whose errors are those at its start, and the final
+# fit.
+TRIAL_FALL_ATOL, FINAL_FALL_ATOL = 1.0, 0.02
+MAX_REDUCED_MISFIT = 4.0  # chi-square over the number of readings, above which a fit is poor and starts elsewhere
 
 
 class Fit(NamedTuple):
@@ -57,8 +58,8 @@ class Fit(NamedTuple):
         return inverse_of(self.normal[np.ix_(self.free, self.free)])[0]
 
     @property
-    def improbability(self) -> float:
-        """Twice the surprise of the fit, up to a constant that all fits of a kind share."""
+    def deviance(self) -> float:
+        """Minus twice the log density of the fit, up to a constant that all fits of a kind share."""
         return float(self.square + 2 * np.sum(np.log(np.diag(self.root))))
 
 
@@ -69,65 +70,65 @@ class FrameFits:
     belief: LoadBelief
     y: np.ndarray
 
-    def best(self, kind: LoadKind, starts: list[np.ndarray]) -> Fit:
+    def best_fit(self, kind: LoadKind, starts: list[np.ndarray]) -> Fit:
         """The best fit from some starts, with the errors at its end.
 
         Errors are those where a fit begins. A fit of another force or place than they are meant for can be worse by its
         own errors, and end far away: then the next start is taken.
         """
-        tried = sorted((self.fit(kind, start, TRIAL_FALL) for start in starts), key=lambda fit: fit.improbability)
+        tried = sorted((self.fit(kind, start, TRIAL_FALL_ATOL) for start in starts), key=lambda fit: fit.deviance)
         found: list[Fit] = []
         for first in tried:
-            found.append(self.fit(kind, first.rows, LAST_FALL))
-            if not self.astray(found[-1]):
+            found.append(self.fit(kind, first.rows, FINAL_FALL_ATOL))
+            if not self.is_poor(found[-1]):
                 return found[-1]
-        return min(found, key=lambda fit: fit.improbability)
+        return min(found, key=lambda fit: fit.deviance)
 
-    def astray(self, fit: Fit) -> bool:
-        """Whether a fit explains so little that another one should start elsewhere."""
-        return not fit.square < ASTRAY * len(self.y)
+    def is_poor(self, fit: Fit) -> bool:
+        """Whether a fit explains so little that another one should start elsewhere (`MAX_REDUCED_MISFIT`)."""
+        return not fit.square < MAX_REDUCED_MISFIT * len(self.y)
 
-    def fit(self, kind: LoadKind, rows: np.ndarray, fall: float) -> Fit:
+    def fit(self, kind: LoadKind, rows: np.ndarray, fall_atol: float) -> Fit:
         """The best loads near a start, with the errors there."""
-        begin, forms = padded(rows), padded_forms(kind)
-        bounds = self.belief.bounds(begin, forms)
-        start, form = self.belief.put(np.clip(begin, *bounds), forms)
-        root = self.errors(unknowns_of(self.belief.sheet, start, form))
-        y, given, low, high, end = self.belief.put(self.y, root, *bounds, np.array(fall))
-        loads, square, normal = fit_loads(Problem(self.belief, y, form, given), start, (low, high), end)
+        start_rows, forms = pad_rows(rows), padded_forms(kind)
+        bounds = self.belief.bounds(start_rows, forms)
+        start, form = self.belief.to_jax(np.clip(start_rows, *bounds), forms)
+        root = self.error_factor(sensitivities_of(self.belief.sheet, start, form))
+        y, factor, low, high, atol = self.belief.to_jax(self.y, root, *bounds, np.array(fall_atol))
+        loads, square, normal = fit_loads(Problem(self.belief, y, form, factor), start, (low, high), atol)
         return Fit(kind, np.asarray(loads), float(square), np.asarray(normal), root)
 
-    def errors(self, unknowns: Unknowns) -> np.ndarray:
+    def error_factor(self, sensitivities: Sensitivities) -> np.ndarray:
         """Cholesky factor of the covariance of the errors: noise, unknowns, and the rest."""
-        slopes = np.asarray(unknowns.nuisances)
-        even = 1 + float(self.belief.model_error) ** 2 * (self.y @ self.y) / len(self.y)
-        return np.linalg.cholesky(even * np.eye(len(self.y)) + slopes @ slopes.T)
+        slopes = np.asarray(sensitivities.nuisances)
+        noise_variance = 1 + float(self.belief.model_error) ** 2 * (self.y @ self.y) / len(self.y)
+        return np.linalg.cholesky(noise_variance * np.eye(len(self.y)) + slopes @ slopes.T)
 
-    def unknowns(self, fit: Fit) -> Unknowns:
+    def sensitivities(self, fit: Fit) -> Sensitivities:
         """Readings of the loads of a fit, and their slopes."""
-        found: Unknowns = unknowns_of(self.belief.sheet, *self.belief.put(fit.loads, fit.forms))
+        found: Sensitivities = sensitivities_of(self.belief.sheet, *self.belief.to_jax(fit.loads, fit.forms))
         return found
 
-    def left(self, fit: Fit) -> tuple[np.ndarray, Unknowns]:
-        """What a fit leaves of the frame, in units of its errors, and the slopes there."""
-        known = self.unknowns(fit)
-        return solve_triangular(fit.root, self.y - np.asarray(known.value), lower=True), known
+    def residual(self, fit: Fit) -> tuple[np.ndarray, Sensitivities]:
+        """Residual of a fit in units of its errors, and the sensitivities there."""
+        sensitivities = self.sensitivities(fit)
+        return solve_triangular(fit.root, self.y - np.asarray(sensitivities.value), lower=True), sensitivities
 
-    def reach(self, one: Fit) -> np.ndarray:
-        """Second moments that the frame asks for beside a single load, (2,): see `elongations`."""
-        left, known = self.left(one)
-        slopes = np.concatenate([np.asarray(known.loads)[:, one.free], np.asarray(known.elongation)], 1)
+    def second_moments(self, one: Fit) -> np.ndarray:
+        """Second moments by which the frame differs from a single load, (2,): see `elongations`."""
+        residual, sensitivities = self.residual(one)
+        slopes = np.concatenate([np.asarray(sensitivities.loads)[:, one.free], np.asarray(sensitivities.elongation)], 1)
         slopes = solve_triangular(one.root, slopes, lower=True)
-        found: np.ndarray = np.linalg.lstsq(slopes, left, rcond=None)[0][-2:]
+        found: np.ndarray = np.linalg.lstsq(slopes, residual, rcond=None)[0][-2:]
         return found
 
-    def surprise(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-        """What is unusual of the loads of a fit (s,), and its slopes in those that are fitted (s, m)."""
-        y, form, root, loads = self.belief.put(self.y, fit.forms, fit.root, fit.loads)
-        unusual, slopes = map(np.asarray, before(Problem(self.belief, y, form, root), loads))
-        return unusual, slopes[:, fit.free]
+    def prior_residual(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+        """Prior residual of the loads of a fit (s,), and its slopes in the free parameters (s, m)."""
+        y, form, root, loads = self.belief.to_jax(self.y, fit.forms, fit.root, fit.loads)
+        residual, slopes = map(np.asarray, linearise_prior(Problem(self.belief, y, form, root), loads))
+        return residual, slopes[:, fit.free]
 
-    def known(self, fit: Fit) -> Known:
-        """What is known at the loads of a fit."""
-        end = self.unknowns(fit)
-        return Known(self.y, end, self.errors(end), *self.surprise(fit))
+    def linearise(self, fit: Fit) -> Linearisation:
+        """Linearise readings and prior at the loads of a fit."""
+        sensitivities = self.sensitivities(fit)
+        return Linearisation(self.y, sensitivities, self.error_factor(sensitivities), *self.prior_residual(fit))

@@ -26,7 +26,7 @@ from ...imaging.noise import InverseError, Whitening, require_real
 from ..result import Contacts
 from .belief import LoadBelief
 from .fits import FrameFits
-from .programs import white
+from .programs import whiten_frame
 from .result import Loads, Proposed
 from .search import FrameSearch
 from .starts import Starts
@@ -67,9 +67,9 @@ class LoadFitter(eqx.Module):
         """Loads of one difference frame (readings,) V, from those that a `Proposal` proposes.
 
         Kinds of a probability below `MIN_PROBABILITY` are not fitted, and the others once each. Probabilities are those
-        of the proposal times what the fits say (`TRUST`). Where the most probable kind leaves more than is believed
-        (`SURPRISING`), all kinds are searched too, and the more probable fit of each counts. A frame that lies outside
-        of what the proposal was trained on is told as without it.
+        of the proposal times those of the fits (`EVIDENCE_WEIGHT`). Where the misfit of the most probable kind is above
+        `MAX_REDUCED_MISFIT`, all kinds are searched too, and the more probable fit of each counts. A frame that lies
+        outside of what the proposal was trained on is fitted as without it.
 
         Args:
             contacts: that a `ContactFinder` saw in the frame, where a search begins; None: from all over the sheet.
@@ -80,7 +80,7 @@ class LoadFitter(eqx.Module):
         require_known("LoadFitter", InverseError, dv, proposed, contacts)
         batch = max(np.ndim(proposed.distance), 0 if contacts is None else contacts.present.ndim - 1)
         search = self._search(dv, batch, contacts)
-        return search.refined(proposed) if not proposed.outside else search.loads()
+        return search.refine(proposed) if not proposed.outside else search.loads()
 
     def whitened(self, dv: Float[ArrayLike, " readings"], batch: int) -> np.ndarray:
         """The whitened readings of one frame."""
@@ -91,7 +91,7 @@ class LoadFitter(eqx.Module):
         if not np.isfinite(dv[used]).all():
             first = int(np.argmax(used & ~np.isfinite(dv)))
             raise InverseError(f"reading {first} is not finite; leave its channel out")
-        return np.asarray(white(self.whitening, self.compress, jnp.asarray(dv, self.compress.dtype)))
+        return np.asarray(whiten_frame(self.whitening, self.compress, jnp.asarray(dv, self.compress.dtype)))
 
     def _search(self, dv: Float[ArrayLike, " readings"], batch: int, contacts: Contacts | None) -> FrameSearch:
         return FrameSearch(FrameFits(self.belief, self.whitened(dv, batch)), self.starts, contacts)

@@ -23,9 +23,9 @@ from .settings import LoadSettings
 from .sheet import AbstractGain, KnownGain, PressedSheet
 from .starts import Starts
 
-# Elements that count: so many times those within so many widths of the middle of a usual load. Half of them miss most
-# of what strong and wide loads do, on whose slopes a fit then ends far from the minimum.
-REACHES, REACH = 4, 2.5
+# Number of elements whose changes count, over that of those within so many widths of the middle of a usual load. Half
+# of them miss most changes by strong and wide loads, on whose slopes a fit then ends far from the minimum.
+ELEMENT_FACTOR, REACH_WIDTHS = 4, 2.5
 
 
 @full_precision
@@ -68,18 +68,18 @@ def prepare_loads(
 
 
 def _belief(sheet: PressedSheet, settings: LoadSettings, low: np.ndarray, high: np.ndarray) -> LoadBelief:
-    """What settings say of loads on a sheet between two corners."""
+    """The prior of loads by their settings, on a sheet between two corners."""
     put = partial(jnp.asarray, dtype=sheet.sigma.dtype)
     return LoadBelief(
         sheet=sheet,
         low=put(low),
         high=put(high),
-        usual=put(np.log([settings.width, settings.force])),
-        spread=put([settings.width_spread, settings.force_spread]),
-        difference=put([settings.width_difference, settings.force_difference]),
-        least=put([settings.nearest, settings.shortest]),
-        length=put(settings.length),
-        prior=put(settings.prior),
+        prior_mean=put(np.log([settings.width, settings.force])),
+        prior_std=put([settings.width_spread, settings.force_spread]),
+        difference_std=put([settings.width_difference, settings.force_difference]),
+        min_separation=put([settings.nearest, settings.shortest]),
+        length_std=put(settings.length),
+        kind_probabilities=put(settings.prior),
         model_error=put(settings.model_error),
         shapes=put(settings.shapes),
         force_logs=put(settings.forces.logs),
@@ -101,11 +101,11 @@ def _sheet(
     put = partial(jnp.asarray, dtype=model.dtype)
     points, weights = points_of(model, settings.width)
     centroids = np.einsum("q,eqd->ed", weights, points)
-    gain, about = settings.gain * field_modes(centroids, settings.gain_length), None
+    gain, known_gain = settings.gain * field_modes(centroids, settings.gain_length), None
     if known is not None:
         mean, gain, covariance = known.distribution(centroids)
-        about = KnownGain(put(np.exp(mean)), put(covariance))
-    modes = _spread_modes(centroids, coat, settings.coat_length)
+        known_gain = KnownGain(put(np.exp(mean)), put(covariance))
+    modes = _scaled_modes(centroids, coat, settings.coat_length)
     sheet = PressedSheet(
         model=model,
         sigma=sigma,
@@ -117,13 +117,13 @@ def _sheet(
         gain=put(gain),
         texture=texture_modes(points, weights, settings, model.dtype),
         coat=put(modes),
-        by_coat=put(np.zeros((len(factor), modes.shape[1]))),
+        untouched_coat_slopes=put(np.zeros((len(factor), modes.shape[1]))),
         shape=put(settings.shape),
         law=settings.law,
-        reach=min(len(centroids), REACHES * _reach(centroids, REACH * settings.width)),
-        known=about,
+        element_count=min(len(centroids), ELEMENT_FACTOR * _max_count_within(centroids, REACH_WIDTHS * settings.width)),
+        known_gain=known_gain,
     )
-    return _without_loads(sheet)
+    return _with_untouched(sheet)
 
 
 def texture_modes(
@@ -131,20 +131,20 @@ def texture_modes(
 ) -> Float[Array, "elements t"]:
     """Modes of the texture of the gain on elements of these points and weights; none where there is no texture."""
     centroids = np.einsum("q,eqd->ed", np.asarray(weights, float), np.asarray(points, float))
-    return jnp.asarray(_spread_modes(centroids, settings.texture, settings.texture_length), dtype)
+    return jnp.asarray(_scaled_modes(centroids, settings.texture, settings.texture_length), dtype)
 
 
-def _spread_modes(points: Float[np.ndarray, "n 2"], spread: float, length: float) -> Float[np.ndarray, "n g"]:
+def _scaled_modes(points: Float[np.ndarray, "n 2"], spread: float, length: float) -> Float[np.ndarray, "n g"]:
     """Modes of a Gaussian field of a standard deviation at points; none for zero."""
     return spread * field_modes(points, length) if spread else np.zeros((len(points), 0))
 
 
 @verb
-def _without_loads(sheet: PressedSheet) -> PressedSheet:
-    """The sheet, which knows its readings without loads."""
+def _with_untouched(sheet: PressedSheet) -> PressedSheet:
+    """The sheet with its readings without loads, and their slopes."""
     z = transfer(sheet.model, coefficients(sheet.model, sheet.sigma))
-    known = sheet.white(z), sheet.coat_slopes(sheet.sigma)
-    ready: PressedSheet = eqx.tree_at(lambda s: (s.untouched, s.by_coat), sheet, known)
+    known = sheet.whiten(z), sheet.coat_slopes(sheet.sigma)
+    ready: PressedSheet = eqx.tree_at(lambda s: (s.untouched, s.untouched_coat_slopes), sheet, known)
     return ready
 
 
@@ -168,6 +168,6 @@ def _atoms(sheet: PressedSheet, rows: Float[Array, "b 4"]) -> Float[Array, "b r"
     return found
 
 
-def _reach(centroids: Float[np.ndarray, "elements 2"], radius: float) -> int:
+def _max_count_within(centroids: Float[np.ndarray, "elements 2"], radius: float) -> int:
     """Largest number of elements within a circle around one of them."""
     return int(cKDTree(centroids).query_ball_point(centroids, radius, return_length=True).max())

@@ -39,18 +39,18 @@ FORMS = {
     LoadKind.MORE: (Form.ROUND, Form.ROUND, Form.ROUND),
 }
 MAX_LOADS, LOAD_PARAMETERS = max(map(len, FORMS.values())), max(form.parameters for form in Form)  # of each load
-FORCE = 3  # of these the log of the force
-ROW = (-0.8, 0.0, 0.8)  # of the half length, places of the round loads that an edge is a row of
-LOG_ROW = np.array([0, 0, 0, np.log(len(ROW)), 0, 0])  # by which each of them is weaker
+FORCE_INDEX = 3  # of the log of the force among these
+LINE_POINTS = (-0.8, 0.0, 0.8)  # places of the round loads that stand for an edge, over its half length
+LINE_POINT_OFFSET = np.array([0, 0, 0, np.log(len(LINE_POINTS)), 0, 0])  # of the edge's parameters over theirs
 SQRT_2, SQRT_3 = math.sqrt(2), math.sqrt(3)
-ELONGATION = 0.3  # standard deviation of second moments over that of the others
+ELONGATION_STD = 0.3  # standard deviation of second moments over that of the others
 
 Parameters = Float[Array, "n 6"]
 Forms = Int[Array, " n"]
 
 
-def padded(rows: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "n 6"]:
-    """All rows of parameters; those that loads do not have repeat the last one."""
+def pad_rows(rows: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "n 6"]:
+    """Pad the parameters of loads to all rows, by repetition of the last one."""
     rows = np.pad(rows, ((0, 0), (0, LOAD_PARAMETERS - rows.shape[1])))
     return np.concatenate([rows, np.repeat(rows[-1:], MAX_LOADS - len(rows), 0)])
 
@@ -69,33 +69,35 @@ def free_parameters(forms: Int[np.ndarray, " n"]) -> Bool[np.ndarray, "n 6"]:
 
 def pressure(loads: Parameters, forms: Forms, points: Float[Array, "... 2"]) -> Float[Array, "..."]:
     """Pressure of all loads at points, Pa."""
-    kinds = (_nothing, spot, line)
-    return jnp.stack([jax.lax.switch(form, kinds, one, points) for one, form in zip(loads, forms, strict=True)]).sum(0)
+    kinds = (_no_pressure, spot, line)
+    return jnp.stack([jax.lax.switch(form, kinds, load, points) for load, form in zip(loads, forms, strict=True)]).sum(
+        0
+    )
 
 
-def _nothing(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
+def _no_pressure(load: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
     return jnp.zeros(points.shape[:-1], points.dtype)
 
 
-def spot(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
+def spot(load: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "..."]:
     """Pressure of a round load: Gaussian."""
-    variance = jnp.exp(2 * one[2])
-    square = jnp.sum((points - one[:2]) ** 2, -1)
-    return jnp.exp(one[3] - 0.5 * square / variance) / (2 * jnp.pi * variance)
+    variance = jnp.exp(2 * load[2])
+    square = jnp.sum((points - load[:2]) ** 2, -1)
+    return jnp.exp(load[3] - 0.5 * square / variance) / (2 * jnp.pi * variance)
 
 
-def line(one: Float[Array, "6"], points: Float[Array, "... 2"], shortest: float = 1e-5) -> Float[Array, "..."]:
+def line(load: Float[Array, "6"], points: Float[Array, "... 2"], min_half: float = 1e-5) -> Float[Array, "..."]:
     """Pressure of an edge: even along a line, blurred by a Gaussian; of a length near zero, a Gaussian.
 
-    Half a line is at least `shortest`, m, since a length of zero has no direction.
+    Half a line is at least `min_half`, m, since a length of zero has no direction.
     """
-    width, half = jnp.exp(one[2]), jnp.sqrt(one[4:] @ one[4:] + shortest**2)
-    away = points - one[:2]
-    along = away @ one[4:] / half
-    across = jnp.sum(away**2, -1) - along**2
+    width, half = jnp.exp(load[2]), jnp.sqrt(load[4:] @ load[4:] + min_half**2)
+    offset = points - load[:2]
+    along = offset @ load[4:] / half
+    across = jnp.sum(offset**2, -1) - along**2
     root = jnp.sqrt(2.0) * width
     spread = (erf((along + half) / root) - erf((along - half) / root)) / (4 * half)
-    return jnp.exp(one[3] - 0.5 * across / width**2) * spread / (jnp.sqrt(2 * jnp.pi) * width)
+    return jnp.exp(load[3] - 0.5 * across / width**2) * spread / (jnp.sqrt(2 * jnp.pi) * width)
 
 
 def shape_directions(loads: Parameters, forms: Forms, points: Float[Array, "... 2"]) -> Float[Array, "... d"]:
@@ -103,11 +105,11 @@ def shape_directions(loads: Parameters, forms: Forms, points: Float[Array, "... 
 
     With ``u = (x - x0) / s`` and ``r = |u|^2 / 2`` they are the Gaussian times the orthonormal polynomials of lowest
     order that change neither force, place nor width: ``L2(r)`` and ``L3(r)`` (flat punch, ring, long tails), which are
-    those of all loads; ``u (r - 2) / sqrt(2)`` (tilted tip) and, times `ELONGATION`, ``(u_x^2 - u_y^2) / 2`` and
+    those of all loads; ``u (r - 2) / sqrt(2)`` (tilted tip) and, times `ELONGATION_STD`, ``(u_x^2 - u_y^2) / 2`` and
     ``u_x u_y`` (tilted or elliptic tip), which each load has of its own. A flat disc has moments of -1/3 in L2 and L3,
     a ring -1/2 and -2/3; what the pad spreads has less.
     """
-    by_load = _rows_of_round(_bent, loads, forms, points)
+    by_load = _sum_along_line(_shape_moments, loads, forms, points)
     return jnp.concatenate([by_load[..., :2].sum(0), *by_load[..., 2:]], -1)
 
 
@@ -122,26 +124,30 @@ def tilt_directions(loads: Parameters, forms: Forms, points: Float[Array, "... 2
 
     They are the Gaussian times ``u (3 - 3 r + r^2 / 2) / sqrt(3)``, in the notation of `shape_directions`.
     """
-    return jnp.concatenate([*_rows_of_round(_tilted, loads, forms, points)], -1)
+    return jnp.concatenate([*_sum_along_line(_tilt_moments, loads, forms, points)], -1)
 
 
-def _rows_of_round(
+def _sum_along_line(
     change: Callable[[Array, Array], Array], loads: Parameters, forms: Forms, points: Float[Array, "... 2"]
 ) -> Float[Array, "n ... d"]:
     """Changes of pressure by each load; an edge is a row of round loads."""
-    row = [(form, one.at[:2].add(t * one[4:]) - LOG_ROW) for form, one in zip(forms, loads, strict=True) for t in ROW]
-    found = [jnp.where(form > Form.ABSENT, change(one, points), 0) for form, one in row]
-    return jnp.stack(found).reshape(len(loads), len(ROW), *found[0].shape).sum(1)
+    rows = [
+        (form, load.at[:2].add(t * load[4:]) - LINE_POINT_OFFSET)
+        for form, load in zip(forms, loads, strict=True)
+        for t in LINE_POINTS
+    ]
+    found = [jnp.where(form > Form.ABSENT, change(load, points), 0) for form, load in rows]
+    return jnp.stack(found).reshape(len(loads), len(LINE_POINTS), *found[0].shape).sum(1)
 
 
-def _tilted(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
-    u = (points - one[:2]) * jnp.exp(-one[2])
+def _tilt_moments(load: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+    u = (points - load[:2]) * jnp.exp(-load[2])
     r = 0.5 * jnp.sum(u**2, -1, keepdims=True)
-    return spot(one, points)[..., None] * u * (3 - 3 * r + r**2 / 2) / SQRT_3
+    return spot(load, points)[..., None] * u * (3 - 3 * r + r**2 / 2) / SQRT_3
 
 
-def _bent(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "... 6"]:
-    return spot(one, points)[..., None] * _polynomials((points - one[:2]) * jnp.exp(-one[2]))
+def _shape_moments(load: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "... 6"]:
+    return spot(load, points)[..., None] * _polynomials((points - load[:2]) * jnp.exp(-load[2]))
 
 
 def _polynomials(u: Float[Array, "... 2"]) -> Float[Array, "... 6"]:
@@ -149,22 +155,22 @@ def _polynomials(u: Float[Array, "... 2"]) -> Float[Array, "... 6"]:
     x, y = u[..., 0], u[..., 1]
     r = 0.5 * (x**2 + y**2)
     radial, tilt = [1 - 2 * r + r**2 / 2, 1 - 3 * r + 1.5 * r**2 - r**3 / 6], (r - 2) / SQRT_2
-    return jnp.stack([*radial, x * tilt, y * tilt, ELONGATION * 0.5 * (x**2 - y**2), ELONGATION * x * y], -1)
+    return jnp.stack([*radial, x * tilt, y * tilt, ELONGATION_STD * 0.5 * (x**2 - y**2), ELONGATION_STD * x * y], -1)
 
 
-def line_shapes(one: Float[Array, "6"], points: Float[Array, "... 2"], shortest: float) -> Float[Array, "... 6"]:
+def line_shapes(load: Float[Array, "6"], points: Float[Array, "... 2"], min_half: float) -> Float[Array, "... 6"]:
     """Change of pressure by each moment by which an edge, or a round load, may differ from that of `line`.
 
     The polynomials are those of `shape_directions`, in units of the standard deviation along the edge and across it:
     along the edge the variance is larger by a third of the square of its half length.
     """
-    variance, square = jnp.exp(2 * one[2]), one[4:] @ one[4:] + shortest**2
-    away = points - one[:2]
+    variance, square = jnp.exp(2 * load[2]), load[4:] @ load[4:] + min_half**2
+    offset = points - load[:2]
     shrink = (jnp.sqrt(variance / (variance + square / 3)) - 1) / square
-    moved = away + (shrink * (away @ one[4:]))[..., None] * one[4:]
-    return line(one, points, shortest)[..., None] * _polynomials(moved * jnp.exp(-one[2]))
+    moved = offset + (shrink * (offset @ load[4:]))[..., None] * load[4:]
+    return line(load, points, min_half)[..., None] * _polynomials(moved * jnp.exp(-load[2]))
 
 
-def elongations(one: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+def elongations(load: Float[Array, "6"], points: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
     """Change of pressure of a round load by second moments: half of those along x minus along y, and of x and y."""
-    return _bent(one, points)[..., -2:] / ELONGATION
+    return _shape_moments(load, points)[..., -2:] / ELONGATION_STD

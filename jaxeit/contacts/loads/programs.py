@@ -16,9 +16,9 @@ from ...linalg import lapack
 from ..fit import SOLVER
 from .belief import LoadBelief
 from .pressure import LOAD_PARAMETERS, MAX_LOADS, Form, Forms, Parameters
-from .sheet import PressedSheet, Unknowns
+from .sheet import PressedSheet, Sensitivities
 
-STEPS = 16  # of a fit at most
+MAX_STEPS = 16  # of a fit at most
 
 
 class Problem(NamedTuple):
@@ -31,27 +31,29 @@ class Problem(NamedTuple):
 
 
 @verb
-def white(whitening: Whitening, compress: Float[Array, "r k"], dv: Float[Array, " readings"]) -> Float[Array, " r"]:
+def whiten_frame(
+    whitening: Whitening, compress: Float[Array, "r k"], dv: Float[Array, " readings"]
+) -> Float[Array, " r"]:
     return compress @ whitening.sums(dv)
 
 
 @verb
-def unknowns_of(sheet: PressedSheet, loads: Parameters, forms: Forms) -> Unknowns:
-    return sheet.unknowns(loads, forms)
+def sensitivities_of(sheet: PressedSheet, loads: Parameters, forms: Forms) -> Sensitivities:
+    return sheet.sensitivities(loads, forms)
 
 
 @verb
 def fit_loads(
-    problem: Problem, start: Parameters, bounds: tuple[Parameters, Parameters], fall: Float[Array, ""]
+    problem: Problem, start: Parameters, bounds: tuple[Parameters, Parameters], fall_atol: Float[Array, ""]
 ) -> tuple[Parameters, Float[Array, ""], Float[Array, "m m"]]:
     """Loads, square and normal matrix; see `Fit`."""
     found: optx.Solution[Array, Any] = optx.least_squares(
         _residual,
-        replace(SOLVER, fall_rtol=0.0, fall_atol=fall),
+        replace(SOLVER, fall_rtol=0.0, fall_atol=fall_atol),
         start.ravel(),
         problem,
         {"lower": bounds[0].ravel(), "upper": bounds[1].ravel(), "quadratic": _quadratic},
-        max_steps=STEPS,
+        max_steps=MAX_STEPS,
         adjoint=ImplicitStep(),
         throw=False,
     )
@@ -59,34 +61,34 @@ def fit_loads(
 
 
 @verb
-def before(problem: Problem, loads: Parameters) -> tuple[Float[Array, " s"], Float[Array, "s m"]]:
-    """What is unusual of loads, and its slopes in their parameters; see `unusual`."""
-    return unusual(loads.ravel(), problem), jax.jacfwd(unusual)(loads.ravel(), problem)
+def linearise_prior(problem: Problem, loads: Parameters) -> tuple[Float[Array, " s"], Float[Array, "s m"]]:
+    """`prior_residual` of loads, and its slopes in their parameters."""
+    return prior_residual(loads.ravel(), problem), jax.jacfwd(prior_residual)(loads.ravel(), problem)
 
 
 def _residual(flat: Float[Array, " m"], problem: Problem) -> Float[Array, " n"]:
-    left = problem.y - problem.belief.sheet.response(flat.reshape(MAX_LOADS, LOAD_PARAMETERS), problem.forms)
-    return jnp.append(lapack.solve_triangular(problem.root, left, lower=True), unusual(flat, problem))
+    residual = problem.y - problem.belief.sheet.response(flat.reshape(MAX_LOADS, LOAD_PARAMETERS), problem.forms)
+    return jnp.append(lapack.solve_triangular(problem.root, residual, lower=True), prior_residual(flat, problem))
 
 
 def _quadratic(flat: Float[Array, " m"], problem: Problem) -> HalfSquares:
     """The sum of squares near some loads; the sheet knows its slopes."""
     sheet, loads = problem.belief.sheet, flat.reshape(MAX_LOADS, LOAD_PARAMETERS)
-    at = sheet.linearised(loads, problem.forms)
-    both = jnp.concatenate([(problem.y - at.value)[:, None], -sheet.slopes(at, loads, problem.forms)], 1)
-    both = lapack.solve_triangular(problem.root, both, lower=True)
-    surprise, by_loads = before(problem, loads)
-    return normal_equations(jnp.append(both[:, 0], surprise), jnp.concatenate([both[:, 1:], by_loads]))
+    at = sheet.linearise(loads, problem.forms)
+    columns = jnp.concatenate([(problem.y - at.value)[:, None], -sheet.slopes(at, loads, problem.forms)], 1)
+    columns = lapack.solve_triangular(problem.root, columns, lower=True)
+    residual, slopes = linearise_prior(problem, loads)
+    return normal_equations(jnp.append(columns[:, 0], residual), jnp.concatenate([columns[:, 1:], slopes]))
 
 
-def unusual(flat: Float[Array, " m"], problem: Problem) -> Float[Array, " s"]:
-    """What is unusual of loads, in standard deviations.
+def prior_residual(flat: Float[Array, " m"], problem: Problem) -> Float[Array, " s"]:
+    """Difference of loads from what is usual, in standard deviations.
 
     Log width and log force, of the first load and of the others less those of the first; half lengths of an edge.
     """
     belief, loads = problem.belief, flat.reshape(MAX_LOADS, LOAD_PARAMETERS)
-    there = problem.forms[:, None] > Form.ABSENT
-    first = (loads[0, 2:4] - belief.usual) / belief.spread
-    others = jnp.where(there, (loads[:, 2:4] - loads[0, 2:4]) / belief.difference, 0)[1:]
-    length = jnp.where(problem.forms[:, None] == Form.LONG, loads[:, 4:] / belief.length, 0)
-    return jnp.concatenate([first, others.ravel(), length.ravel()])
+    present = problem.forms[:, None] > Form.ABSENT
+    first = (loads[0, 2:4] - belief.prior_mean) / belief.prior_std
+    others = jnp.where(present, (loads[:, 2:4] - loads[0, 2:4]) / belief.difference_std, 0)[1:]
+    half_lengths = jnp.where(problem.forms[:, None] == Form.LONG, loads[:, 4:] / belief.length_std, 0)
+    return jnp.concatenate([first, others.ravel(), half_lengths.ravel()])

@@ -1,4 +1,4 @@
-"""From loads to whitened readings, with slopes in the loads and in all that is not known about the sheet.
+"""From loads to whitened readings, with sensitivities to the loads and to all unknowns of the sheet.
 
 All slopes are those of the readings in the conductivity, which the fields of the electrodes hold (`model.sensitivity`),
 times changes of the conductivity. These vanish away from the loads, so that the elements with the largest changes
@@ -22,25 +22,25 @@ from ...model.forward_model import coefficients, fields, series_resistance, tran
 from ...model.sensitivity import element_slopes
 from .pressure import Forms, Parameters, elongations, pressure, shape_directions, tilt_directions
 
-MODES = 72  # of the gain that loads reach, of those on the whole sheet; and as many of its texture
+MAX_MODES = 72  # of the gain, those that change the readings of the loads most; and as many of its texture
 
 
-class Linearised(NamedTuple):
-    """Readings of loads near some.
+class ElementSlopes(NamedTuple):
+    """Readings of loads, and their slopes in the conductivity of elements.
 
     | meaning                                                                  | shape  |
     |--------------------------------------------------------------------------|--------|
     | value: whitened readings                                                 | (r,)   |
-    | near: elements whose conductivity changes most with the loads            | (e,)   |
+    | elements: whose conductivity changes most with the loads                 | (e,)   |
     | by_element: slopes of the pair sums in the conductivity of these         | (e, k) |
     """
 
     value: Float[Array, " r"]
-    near: Int[Array, " e"]
+    elements: Int[Array, " e"]
     by_element: Float[Array, "e k"]
 
 
-class Unknowns(NamedTuple):
+class Sensitivities(NamedTuple):
     """Whitened readings (r,), and their slopes.
 
     | meaning: in what the slopes are                                                   | shape    |
@@ -97,10 +97,10 @@ class PressedSheet(eqx.Module):
     | gain: modes of the log gain of the contact layer, at centroids        | (elements, g)    | 1     |
     | texture: further modes of that gain, which are never learned          | (elements, t)    | 1     |
     | coat: modes of the log conductivity that is not known                 | (elements, c)    | 1     |
-    | by_coat: slopes of the whitened readings in these without loads       | (r, c)           |       |
+    | untouched_coat_slopes: of the whitened readings in these without loads | (r, c)          |       |
     | shape: standard deviation of the moments of a load's shape            | ()               | 1     |
-    | known: of the gain; None: its modes have a deviation of one, and mean zero |             |       |
-    | reach: number of elements that loads change                           |                  |       |
+    | element_count: number of elements that loads change                   |                  |       |
+    | known_gain: None: its modes have a deviation of one, and mean zero    |                  |       |
     """
 
     model: Model
@@ -113,56 +113,60 @@ class PressedSheet(eqx.Module):
     gain: Float[Array, "elements g"]
     texture: Float[Array, "elements t"]
     coat: Float[Array, "elements c"]
-    by_coat: Float[Array, "r c"]
+    untouched_coat_slopes: Float[Array, "r c"]
     shape: Float[Array, ""]
     law: ContactPiezoresistance
-    reach: int = eqx.field(static=True)
-    known: KnownGain | None = None
+    element_count: int = eqx.field(static=True)
+    known_gain: KnownGain | None = None
 
     def response(self, loads: Parameters, forms: Forms) -> Float[Array, " r"]:
         """Whitened readings of loads."""
-        z = transfer(self.model, coefficients(self.model, self._pressed(loads, forms)))
-        return self.white(z) - self.untouched
+        z = transfer(self.model, coefficients(self.model, self._conductivity(loads, forms)))
+        return self.whiten(z) - self.untouched
 
-    def linearised(self, loads: Parameters, forms: Forms) -> Linearised:
+    def linearise(self, loads: Parameters, forms: Forms) -> ElementSlopes:
         """Readings, and their slopes in the conductivity of the elements that changes of the loads change most."""
-        sigma = self._pressed(loads, forms)
-        near = self._near(loads, forms)
+        sigma = self._conductivity(loads, forms)
+        elements = self._changed_elements(loads, forms)
         theta = coefficients(self.model, sigma)
         x = fields(self.model, theta)
         z = x.terminal + jnp.diag(series_resistance(self.model.system, theta))
-        slopes = element_slopes(self.model, theta, x.potential, near, self.pairs)
-        return Linearised(self.white(z) - self.untouched, near, slopes)
+        slopes = element_slopes(self.model, theta, x.potential, elements, self.pairs)
+        return ElementSlopes(self.whiten(z) - self.untouched, elements, slopes)
 
-    def slopes(self, at: Linearised, loads: Parameters, forms: Forms) -> Float[Array, "r m"]:
+    def slopes(self, at: ElementSlopes, loads: Parameters, forms: Forms) -> Float[Array, "r m"]:
         """Slopes of the readings in all parameters of the loads."""
-        by_loads = jax.jacfwd(lambda loads: self._pressed(loads, forms, at.near))(loads)
-        return self._mixed(at, by_loads.reshape(len(at.near), -1))
+        by_loads = jax.jacfwd(lambda loads: self._conductivity(loads, forms, at.elements))(loads)
+        return self._reading_changes(at, by_loads.reshape(len(at.elements), -1))
 
-    def unknowns(self, loads: Parameters, forms: Forms) -> Unknowns:
+    def sensitivities(self, loads: Parameters, forms: Forms) -> Sensitivities:
         """Slopes of the readings in gain, coat and shapes of loads, and in the loads themselves."""
-        at = self.linearised(loads, forms)
-        points = self.points[at.near]
-        factor = self._factor(at.near)
-        here = pressure(loads, forms, points) * factor
-        slope = jax.jvp(self.law.factor, (here,), (jnp.ones_like(here),))[1]
-        by_pressure = self.sigma[at.near, None] * slope * self.weights
-        by_gain, by_pressure = jnp.sum(by_pressure * here, 1), by_pressure * factor
-        gain, there = _reached(by_gain, self.gain[at.near])
-        if self.known is not None:
-            gain = gain @ lapack.cholesky(self.known.covariance[jnp.ix_(there, there)], lower=True)
-        gain = jnp.concatenate([gain, _reached(by_gain, self.texture[at.near])[0]], 1)
+        at = self.linearise(loads, forms)
+        points = self.points[at.elements]
+        factor = self._gain_factor(at.elements)
+        effective = pressure(loads, forms, points) * factor
+        slope = jax.jvp(self.law.factor, (effective,), (jnp.ones_like(effective),))[1]
+        by_pressure = self.sigma[at.elements, None] * slope * self.weights
+        by_gain, by_pressure = jnp.sum(by_pressure * effective, 1), by_pressure * factor
+        gain, strongest = _strongest_modes(by_gain, self.gain[at.elements])
+        if self.known_gain is not None:
+            gain = gain @ lapack.cholesky(self.known_gain.covariance[jnp.ix_(strongest, strongest)], lower=True)
+        gain = jnp.concatenate([gain, _strongest_modes(by_gain, self.texture[at.elements])[0]], 1)
         shapes, tilts = shape_directions(loads, forms, points), tilt_directions(loads, forms, points)
-        bent = jnp.concatenate([self.shape * shapes, self.shape * tilts, elongations(loads[0], points)], -1)
-        by_shape = jnp.einsum("eq,eqd->ed", by_pressure, bent)
-        mixed = self._mixed(at, jnp.concatenate([gain, by_shape, self._by_law(at.near, here)], 1))
+        moments = jnp.concatenate([self.shape * shapes, self.shape * tilts, elongations(loads[0], points)], -1)
+        by_shape = jnp.einsum("eq,eqd->ed", by_pressure, moments)
+        changes = self._reading_changes(
+            at, jnp.concatenate([gain, by_shape, self._law_slopes(at.elements, effective)], 1)
+        )
         ends = np.cumsum([gain.shape[1], shapes.shape[-1], tilts.shape[-1], 2])
-        _, by_shapes, by_tilts, elongation, by_law = jnp.split(mixed, ends, 1)
-        nuisances = mixed[:, : ends[1]]
+        _, by_shapes, by_tilts, elongation, by_law = jnp.split(changes, ends, 1)
+        nuisances = changes[:, : ends[1]]
         if self.coat.shape[1]:
-            by_coat = self.coat_slopes(self._pressed(loads, forms)) - self.by_coat
+            by_coat = self.coat_slopes(self._conductivity(loads, forms)) - self.untouched_coat_slopes
             nuisances = jnp.concatenate([nuisances, by_coat], 1)
-        return Unknowns(at.value, nuisances, by_shapes, by_tilts, self.slopes(at, loads, forms), elongation, by_law)
+        return Sensitivities(
+            at.value, nuisances, by_shapes, by_tilts, self.slopes(at, loads, forms), elongation, by_law
+        )
 
     def coat_slopes(self, sigma: Float[Array, " elements"]) -> Float[Array, "r c"]:
         """Slopes of the readings of a sheet in its log conductivity."""
@@ -172,47 +176,51 @@ class PressedSheet(eqx.Module):
         found: Array = self.factor @ (slopes.T @ (sigma[:, None] * self.coat))
         return found
 
-    def white(self, z: Float[Array, "a a"]) -> Float[Array, " r"]:
+    def whiten(self, z: Float[Array, "a a"]) -> Float[Array, " r"]:
         """Whitened readings of a transfer matrix."""
         return self.factor @ z[self.pairs[:, 0], self.pairs[:, 1]]
 
-    def _pressed(
+    def _conductivity(
         self, loads: Parameters, forms: Forms, elements: Int[Array, " e"] | slice = slice(None)
     ) -> Float[Array, " e"]:
         """Conductivity of elements under loads, S."""
-        felt = pressure(loads, forms, self.points[elements]) * self._factor(elements)
-        return self.sigma[elements] * (self.law.factor(felt) @ self.weights)
+        effective = pressure(loads, forms, self.points[elements]) * self._gain_factor(elements)
+        return self.sigma[elements] * (self.law.factor(effective) @ self.weights)
 
-    def _near(self, loads: Parameters, forms: Forms) -> Int[Array, " e"]:
-        """Elements that a change of some load's force changes most, as parts of the most that it changes any.
+    def _changed_elements(self, loads: Parameters, forms: Forms) -> Int[Array, " e"]:
+        """Elements that a change of some load's force changes most, relative to the most changed one.
 
         Those that are most changed would be the wrong ones: a strong load saturates its middle, where another force is
         not felt, and would leave none to a weaker one.
         """
-        by_force = jax.jacfwd(lambda force: self._pressed(loads.at[:, 3].set(force), forms) / self.sigma)(loads[:, 3])
-        most = jnp.maximum(jnp.max(by_force, 0), jnp.finfo(by_force.dtype).tiny)
-        near: Int[Array, " e"] = jax.lax.top_k(jnp.max(by_force / most, 1), self.reach)[1]
-        return near
+        by_force = jax.jacfwd(lambda force: self._conductivity(loads.at[:, 3].set(force), forms) / self.sigma)(
+            loads[:, 3]
+        )
+        largest = jnp.maximum(jnp.max(by_force, 0), jnp.finfo(by_force.dtype).tiny)
+        elements: Int[Array, " e"] = jax.lax.top_k(jnp.max(by_force / largest, 1), self.element_count)[1]
+        return elements
 
-    def _by_law(self, near: Int[Array, " e"], pressure: Float[Array, "e q"]) -> Float[Array, "e 3"]:
+    def _law_slopes(self, elements: Int[Array, " e"], pressure: Float[Array, "e q"]) -> Float[Array, "e 3"]:
         """Slopes of the conductivity of elements in the logs of the parameters of the law."""
         slopes = jax.jacfwd(lambda logs: scaled_law(self.law, logs).factor(pressure) @ self.weights)
-        found: Array = self.sigma[near, None] * slopes(jnp.zeros(3, self.sigma.dtype))
+        found: Array = self.sigma[elements, None] * slopes(jnp.zeros(3, self.sigma.dtype))
         return found
 
-    def _factor(self, elements: Int[Array, " e"] | slice) -> Float[Array, "e 1"] | float:
+    def _gain_factor(self, elements: Int[Array, " e"] | slice) -> Float[Array, "e 1"] | float:
         """Factor of the pressure on elements: the mean gain, where it is known."""
-        return 1.0 if self.known is None else self.known.factor[elements, None]
+        return 1.0 if self.known_gain is None else self.known_gain.factor[elements, None]
 
-    def _mixed(self, at: Linearised, change: Float[Array, "e d"]) -> Float[Array, "r d"]:
-        """What a change of the conductivity near the loads does to the readings."""
+    def _reading_changes(self, at: ElementSlopes, change: Float[Array, "e d"]) -> Float[Array, "r d"]:
+        """Changes of the readings by changes of the conductivity of some elements."""
         return self.factor @ (at.by_element.T @ change)
 
 
-def _reached(by_gain: Float[Array, " e"], modes: Float[Array, "e g"]) -> tuple[Float[Array, "e m"], Int[Array, " m"]]:
-    """Changes of the conductivity by the modes that change it most, and which ones these are."""
-    there: Int[Array, " m"] = jax.lax.top_k(by_gain @ modes, min(MODES, modes.shape[1]))[1]
-    return by_gain[:, None] * modes[:, there], there
+def _strongest_modes(
+    by_gain: Float[Array, " e"], modes: Float[Array, "e g"]
+) -> tuple[Float[Array, "e m"], Int[Array, " m"]]:
+    """Changes of the conductivity by the modes that change it most, and the indices of these."""
+    strongest: Int[Array, " m"] = jax.lax.top_k(by_gain @ modes, min(MAX_MODES, modes.shape[1]))[1]
+    return by_gain[:, None] * modes[:, strongest], strongest
 
 
 def scaled_law(law: ContactPiezoresistance, logs: Float[Array, "3"] | Sequence[float]) -> ContactPiezoresistance:

@@ -33,64 +33,66 @@ class Starts(eqx.Module):
         """One load in the place of all contacts, or the atom that explains most; (1, 4)."""
         present = np.asarray(contacts.present)
         if not present.any():
-            return self.atom(y, np.eye(len(y)))[1]
-        rows, weight = self.rows(contacts), np.where(present, np.asarray(contacts.strength), 0)
-        middle = weight @ rows[:, :3] / weight.sum()
-        return np.append(middle, logsumexp(rows[present, 3]))[None]
+            return self.best_atom(y, np.eye(len(y)))[1]
+        rows, weight = self.as_loads(contacts), np.where(present, np.asarray(contacts.strength), 0)
+        centre = weight @ rows[:, :3] / weight.sum()
+        return np.append(centre, logsumexp(rows[present, 3]))[None]
 
-    def seen(self, contacts: Contacts, count: int) -> list[np.ndarray]:
+    def strongest(self, contacts: Contacts, count: int) -> list[np.ndarray]:
         """The strongest contacts (count, 4), if there are so many."""
-        return [self.rows(contacts)[:count]] if np.sum(contacts.present) >= count else []
+        return [self.as_loads(contacts)[:count]] if np.sum(contacts.present) >= count else []
 
-    def split(self, one: np.ndarray, moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A load as two narrower ones (2, 4), and as an edge (1, 6), with the second moments that a frame asks for.
+    def split(self, load: np.ndarray, moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A load as two narrower ones (2, 4), and as an edge (1, 6), with second moments by a frame.
 
         Halves at d from the middle change the pressure by ``(dx^2 - dy^2) / 2`` and ``dx dy`` times `elongations`, in
         units of the width.
         """
         angle = 0.5 * np.arctan2(moments[1], moments[0])
         length = np.clip(np.sqrt(2 * np.hypot(*moments)), MIN_REACH, MAX_REACH)
-        step = length * np.exp(one[2]) * np.array([np.cos(angle), np.sin(angle)])
-        width = one[2] + 0.5 * np.log(max(1 - 0.5 * length**2, 0.25))
-        half = np.array([width, one[3] - np.log(2)])
-        halves = np.stack([np.append(one[:2] + step, half), np.append(one[:2] - step, half)])
-        return halves, np.concatenate([one[:2], [width, one[3]], np.sqrt(3) * step])[None]
+        step = length * np.exp(load[2]) * np.array([np.cos(angle), np.sin(angle)])
+        width = load[2] + 0.5 * np.log(max(1 - 0.5 * length**2, 0.25))
+        half = np.array([width, load[3] - np.log(2)])
+        halves = np.stack([np.append(load[:2] + step, half), np.append(load[:2] - step, half)])
+        return halves, np.concatenate([load[:2], [width, load[3]], np.sqrt(3) * step])[None]
 
     @staticmethod
-    def between(two: np.ndarray) -> tuple[float, np.ndarray]:
+    def edge_between(two: np.ndarray) -> tuple[float, np.ndarray]:
         """Share of the weaker of two loads, and an edge (1, 6) with their force, middle and second moment along it."""
         share = np.exp(two[:, 3] - logsumexp(two[:, 3]))
         half = np.sqrt(3 * share[0] * share[1]) * (two[1, :2] - two[0, :2])
         return float(share.min()), np.concatenate([share @ two[:, :3], [logsumexp(two[:, 3])], half])[None]
 
-    def another(
-        self, two: np.ndarray, root: np.ndarray, left: np.ndarray, slopes: np.ndarray
+    def with_third(
+        self, two: np.ndarray, root: np.ndarray, residual: np.ndarray, slopes: np.ndarray
     ) -> tuple[float, np.ndarray]:
-        """Two loads and the atom that explains most of what they leave, (3, 4); and by how much chi-square falls with
-        it, where the two give way along their slopes (r, m)."""
-        fall, atom = self.atom(left, root, slopes)
+        """Two loads and the atom that explains most of their residual, (3, 4); and by how much chi-square falls with
+        it, with the two eliminated along their slopes (r, m)."""
+        fall, atom = self.best_atom(residual, root, slopes)
         return fall, np.concatenate([two[:, :4], atom])
 
-    def atom(self, left: np.ndarray, root: np.ndarray, slopes: np.ndarray | None = None) -> tuple[float, np.ndarray]:
-        """The atom that explains most of what is left in units of errors: fall of chi-square, and the load (1, 4).
+    def best_atom(
+        self, residual: np.ndarray, root: np.ndarray, slopes: np.ndarray | None = None
+    ) -> tuple[float, np.ndarray]:
+        """The atom that explains most of a residual in units of errors: fall of chi-square, and the load (1, 4).
 
         An atom that the slopes explain nearly all of is no other load: its strength would be a quotient of roundings.
         """
         atoms = solve_triangular(root, np.asarray(self.atoms).T, lower=True)
-        whole = np.linalg.norm(atoms, axis=0)
+        lengths = np.linalg.norm(atoms, axis=0)
         if slopes is not None:
-            along = orth(solve_triangular(root, slopes, lower=True))
-            atoms, left = (part - along @ (along.T @ part) for part in (atoms, left))
+            basis = orth(solve_triangular(root, slopes, lower=True))
+            atoms, residual = (part - basis @ (basis.T @ part) for part in (atoms, residual))
         norms = np.linalg.norm(atoms, axis=0)
-        apart = norms**2 > MIN_INDEPENDENT_FRACTION * whole**2
-        norms = np.where(apart, norms, 1)
-        gain = np.where(apart, atoms.T @ left / norms, -np.inf)
+        independent = norms**2 > MIN_INDEPENDENT_FRACTION * lengths**2
+        norms = np.where(independent, norms, 1)
+        gain = np.where(independent, atoms.T @ residual / norms, -np.inf)
         best = int(np.argmax(gain))
         force = max(gain[best] / norms[best], 0.02)  # over that of the atom
         fall = float(max(gain[best], 0) ** 2)
         return fall, (np.asarray(self.places)[best] + [0, 0, 0, np.log(force)])[None]
 
-    def rows(self, contacts: Contacts) -> np.ndarray:
+    def as_loads(self, contacts: Contacts) -> np.ndarray:
         """Contacts as loads (K, 4): the force whose pressure changes the middle of the bump as much."""
         width, law = np.maximum(np.asarray(contacts.width), 1e-3), jax.tree.map(float, self.law)
         change = np.clip(np.asarray(contacts.amplitude) / float(self.background) / law.amplitude, 0.01, 0.95)

@@ -19,7 +19,7 @@ found force in the logs of the law, with errors of Student's law (Lange, Little 
 
 What the law leaves has two parts. Protrusions, and loads that are not Gaussians, are like a gain that changes over a
 few millimetres: its standard deviation, the texture, is the one under which all presses together are most probable.
-What is left even so is the model error (`fitted_model_error`).
+What is left even so is the model error (`select_model_error`).
 """
 
 from dataclasses import replace
@@ -38,39 +38,39 @@ from ....kinds import require_unmasked
 from ....model.discretisation import Model
 from ..belief import LoadBelief
 from ..comparison import log_evidence
-from ..considered import inverse_of, mean_errors, slopes_in_law
-from ..fits import LAST_FALL, Fit, FrameFits
+from ..considered import inverse_of, law_sensitivities, mean_errors
+from ..fits import FINAL_FALL_ATOL, Fit, FrameFits
 from ..preparation import prepare_loads, texture_modes
-from ..pressure import FORCE
+from ..pressure import FORCE_INDEX
 from ..result import LoadKind
 from ..settings import ForceLaw, LoadSettings
 from ..sheet import AbstractGain, scaled_law
-from .model_error import fitted_model_error
+from .model_error import select_model_error
 
-# Standard deviations of the logs of amplitude, half pressure and exponent before any press. Amplitude and half pressure
-# of a layer are hardly known; with larger exponents fits of weak or long loads seldom find their end.
-SPREAD = np.array([0.7, 1.0, 0.05])
+# Prior standard deviations of the logs of amplitude, half pressure and exponent. Amplitude and half pressure of a layer
+# are hardly known; with larger exponents fits of weak or long loads seldom converge.
+LAW_STD = np.array([0.7, 1.0, 0.05])
 # Standard deviations of the gain's texture that are tried, until presses are less probable.
 TEXTURES = (0.0, 0.1, 0.2)
-# Standard deviation of the log of a force that a load cell tells.
+# Standard deviation of the log of a force that a load cell measures.
 FORCE_ERROR = 0.03
-# Presses that tell loads, at least.
-FEWEST = 6
-# Log of the ratio of probabilities from which a press speaks for a larger model error, which weak ones hardly do.
-SURELY = 2.0
-# Steps of the law under each texture; how often one is halved; largest change of a log in a step, and the one below
-# which steps end.
-STEPS, HALVINGS, MOST_STEP, LEAST_STEP = 4, 2, 0.7, 0.03
-# Standard deviations of the logs of amplitude, half pressure and exponent, by which the law of forces differs.
-FORCE_SPREAD = np.array([0.3, 0.3, 0.5])
-# Degrees of freedom of the errors of told forces; number of presses that count as much as what fits state of these.
-FREEDOM, STATED = 4, 8
-# Log of the largest force over the smallest, below which presses do not tell how told forces depend on the force: what
-# the law of forces then says of others is a guess.
-FORCES_APART = np.log(2)
-REWEIGHTED = 30  # times that presses are weighed, of which a few suffice
-# Chi-square of a press over the median, beyond which it is left out.
-UNUSUAL = 5.0
+# Smallest number of presses to learn from.
+MIN_PRESSES = 6
+# Smallest log of the ratio of probabilities with which a press supports a larger model error; weak ones hardly do.
+MIN_LOG_RATIO = 2.0
+# Largest number of steps of the law under each texture, and of halvings of one; largest change of a log in a step, and
+# the one below which steps end.
+MAX_STEPS, MAX_HALVINGS, MAX_STEP, MIN_STEP = 4, 2, 0.7, 0.03
+# Prior standard deviations of the logs of amplitude, half pressure and exponent, by which the law of forces differs.
+FORCE_LAW_STD = np.array([0.3, 0.3, 0.5])
+# Degrees of freedom of the errors of fitted forces; number of presses that count as much as the errors that fits state.
+DEGREES_OF_FREEDOM, PRIOR_WEIGHT = 4, 8
+# Log of the largest force over the smallest, below which no law of forces is learned: presses do not tell then how
+# fitted forces depend on the force, and the law would be a guess for others.
+MIN_LOG_FORCE_RANGE = np.log(2)
+REWEIGHTINGS = 30  # of presses, of which a few suffice
+# Chi-square over the median beyond which a press is an outlier, and left out.
+OUTLIER_RATIO = 5.0
 
 
 def learn_loads(
@@ -100,8 +100,8 @@ def learn_loads(
         noise, untouched, sigma, channels, gain: as for `prepare_loads`.
 
     Raises:
-        InverseError: if there are fewer than `FEWEST` presses, an array has another shape, a place or a force is not a
-            number or the force not above zero, or jit hides the values; and as for `prepare_loads`.
+        InverseError: if there are fewer than `MIN_PRESSES` presses, an array has another shape, a place or a force is
+            not a number or the force not above zero, or jit hides the values; and as for `prepare_loads`.
 
     Example:
         x, y = jnp.meshgrid(jnp.array([0.05, 0.1, 0.15]), jnp.array([0.06, 0.14]))
@@ -122,31 +122,31 @@ def learn_loads(
     usual = replace(settings or LoadSettings(), forces=ForceLaw())
     fitter = prepare_loads(model, usual, noise=noise, untouched=untouched, sigma=sigma, channels=channels, gain=gain)
     presses = _Presses(fitter.belief, np.stack([fitter.whitened(frame, 0) for frame in frames]), np.log(forces))
-    learned, final, best, logs, counted = usual, presses, -np.inf, np.zeros(3), np.ones(len(forces), bool)
+    learned, best_presses, best, logs, informative = usual, presses, -np.inf, np.zeros(3), np.ones(len(forces), bool)
     starts = list(np.column_stack([places, np.full(len(forces), np.log(usual.width)), np.log(forces)])[:, None])
     for texture in TEXTURES:
-        tried = replace(usual, texture=texture)
-        textured = presses.with_texture(tried)
-        logs, fits = _fitted_law(textured, logs, starts)
-        under = textured.under(logs)
-        error, evidences = _model_error(under, fits)
+        candidate = replace(usual, texture=texture)
+        textured = presses.with_texture(candidate)
+        logs, fits = _fit_law(textured, logs, starts)
+        fitted = textured.with_law(logs)
+        error, evidences = _model_error(fitted, fits)
         if learned is usual:
-            counted = np.isfinite(evidences)  # a press that no load explains tells nothing under any texture
-        if not (evidence := float(evidences[counted].sum())) > best:
+            informative = np.isfinite(evidences)  # a press that no load explains tells nothing under any texture
+        if not (evidence := float(evidences[informative].sum())) > best:
             break
-        learned, best = replace(tried, law=under.belief.sheet.law, model_error=error), evidence
-        starts, final = [fit.rows[:, :4] for fit in fits], under.with_error(error)
-    if np.ptp(np.log(forces[counted])) < FORCES_APART:
+        learned, best = replace(candidate, law=fitted.belief.sheet.law, model_error=error), evidence
+        starts, best_presses = [fit.rows[:, :4] for fit in fits], fitted.with_error(error)
+    if np.ptp(np.log(forces[informative])) < MIN_LOG_FORCE_RANGE:
         return learned
-    return replace(learned, forces=_force_law(final, starts, counted))
+    return replace(learned, forces=_force_law(best_presses, starts, informative))
 
 
 def _require_presses(frames: np.ndarray, places: np.ndarray, forces: np.ndarray) -> None:
     count = len(frames)
-    if count < FEWEST or frames.ndim != 2 or places.shape != (count, 2) or forces.shape != (count,):
+    if count < MIN_PRESSES or frames.ndim != 2 or places.shape != (count, 2) or forces.shape != (count,):
         raise InverseError(
             f"dv {frames.shape}, position {places.shape} and force {forces.shape} tell no law of pressure; give "
-            f"{FEWEST} presses or more, as (n, readings), (n, 2) and (n,)"
+            f"{MIN_PRESSES} presses or more, as (n, readings), (n, 2) and (n,)"
         )
     wrong = ~(np.isfinite(places).all(1) & np.isfinite(forces) & (forces > 0))
     if wrong.any():
@@ -158,7 +158,7 @@ def _require_presses(frames: np.ndarray, places: np.ndarray, forces: np.ndarray)
 
 
 class _Presses(NamedTuple):
-    """Single presses, and what is believed of loads when they are fitted.
+    """Single presses, and the prior of loads in their fits.
 
     | meaning                            | shape  |
     |------------------------------------|--------|
@@ -170,8 +170,8 @@ class _Presses(NamedTuple):
     y: np.ndarray
     log_force: np.ndarray
 
-    def under(self, logs: np.ndarray) -> "_Presses":
-        """The presses, where amplitude, half pressure and exponent of the law are those of now times exp of these."""
+    def with_law(self, logs: np.ndarray) -> "_Presses":
+        """The presses under a law whose amplitude, half pressure and exponent are those of now times exp of these."""
         return self._with_sheet(law=scaled_law(self.belief.sheet.law, logs.tolist()))
 
     def with_texture(self, settings: LoadSettings) -> "_Presses":
@@ -189,96 +189,101 @@ class _Presses(NamedTuple):
 
     def frame(self, k: int) -> FrameFits:
         """The fits of one press, whose force is known."""
-        usual, spread = self.belief.usual.at[1].set(self.log_force[k]), self.belief.spread.at[1].set(FORCE_ERROR)
-        return FrameFits(replace(self.belief, usual=usual, spread=spread), self.y[k])
+        usual, spread = (
+            self.belief.prior_mean.at[1].set(self.log_force[k]),
+            self.belief.prior_std.at[1].set(FORCE_ERROR),
+        )
+        return FrameFits(replace(self.belief, prior_mean=usual, prior_std=spread), self.y[k])
 
     def fits(self, starts: list[np.ndarray]) -> list[Fit]:
         """One load for each press, from where it begins, (1, 4)."""
-        return [self.frame(k).fit(LoadKind.ONE, start, LAST_FALL) for k, start in enumerate(starts)]
+        return [self.frame(k).fit(LoadKind.ONE, start, FINAL_FALL_ATOL) for k, start in enumerate(starts)]
 
-    def missed(self, k: int, start: np.ndarray) -> tuple[float, float, np.ndarray]:
-        """Log of the force of one press that its readings tell, over the true one; its variance, its slopes (3,)."""
+    def force_error(self, k: int, start: np.ndarray) -> tuple[float, float, np.ndarray]:
+        """Log of the fitted force of one press over the true one; its variance; its slopes in the law (3,)."""
         frame = FrameFits(self.belief, self.y[k])
-        fit = frame.fit(LoadKind.ONE, start, LAST_FALL)
-        known = frame.known(fit)
-        square = mean_errors(known, fit.free, np.asarray(self.belief.shapes, float))[1]
-        missed = float(fit.loads[0, FORCE] - self.log_force[k])
-        return missed, float(square[FORCE, FORCE]), slopes_in_law(known, fit.free)[FORCE]
+        fit = frame.fit(LoadKind.ONE, start, FINAL_FALL_ATOL)
+        linear = frame.linearise(fit)
+        square = mean_errors(linear, fit.free, np.asarray(self.belief.shapes, float))[1]
+        slopes = law_sensitivities(linear, fit.free)[FORCE_INDEX]
+        log_error = float(fit.loads[0, FORCE_INDEX] - self.log_force[k])
+        return log_error, float(square[FORCE_INDEX, FORCE_INDEX]), slopes
 
-    def normal(self, fits: list[Fit], kept: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Normal matrix (3, 3) and gradient (3,) of some presses in the logs of the law, in which loads give way."""
-        matrix, towards = np.zeros((3, 3)), np.zeros(3)
-        for k in kept:
-            slopes, left = self._of_law(k, fits[k])
-            matrix, towards = matrix + slopes.T @ slopes, towards + slopes.T @ left
-        return matrix, towards
+    def normal_equations(self, fits: list[Fit], inliers: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Normal matrix (3, 3) and gradient (3,) of some presses in the logs of the law, with loads eliminated."""
+        matrix, gradient = np.zeros((3, 3)), np.zeros(3)
+        for k in inliers:
+            slopes, residual = self._law_residual(k, fits[k])
+            matrix, gradient = matrix + slopes.T @ slopes, gradient + slopes.T @ residual
+        return matrix, gradient
 
-    def _of_law(self, k: int, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-        """Slopes of a press in the logs of the law, and what is left of it, in standard deviations, without what its
-        load explains."""
+    def _law_residual(self, k: int, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+        """Slopes of a press in the logs of the law, and its residual, in standard deviations, with its load
+        eliminated."""
         frame = self.frame(k)
-        left, known = frame.left(fit)
-        unusual, by_loads = frame.surprise(fit)
-        slopes = np.concatenate([known.law, np.asarray(known.loads)[:, fit.free]], 1)
+        residual, sensitivities = frame.residual(fit)
+        prior_residual, prior_slopes = frame.prior_residual(fit)
+        slopes = np.concatenate([sensitivities.law, np.asarray(sensitivities.loads)[:, fit.free]], 1)
         slopes = solve_triangular(fit.root, slopes, lower=True)
-        along = np.linalg.qr(np.concatenate([slopes[:, 3:], by_loads]))[0]
-        whole = np.column_stack([np.pad(slopes[:, :3], ((0, len(unusual)), (0, 0))), np.append(left, -unusual)])
-        rest = whole - along @ (along.T @ whole)
-        return rest[:, :3], rest[:, 3]
+        basis = np.linalg.qr(np.concatenate([slopes[:, 3:], prior_slopes]))[0]
+        law_slopes = np.pad(slopes[:, :3], ((0, len(prior_residual)), (0, 0)))
+        columns = np.column_stack([law_slopes, np.append(residual, -prior_residual)])
+        projected = columns - basis @ (basis.T @ columns)
+        return projected[:, :3], projected[:, 3]
 
 
-def _fitted_law(presses: _Presses, logs: np.ndarray, starts: list[np.ndarray]) -> tuple[np.ndarray, list[Fit]]:
-    """Logs (3,) by which the law changes under which the presses are least surprising, and their loads."""
+def _fit_law(presses: _Presses, logs: np.ndarray, starts: list[np.ndarray]) -> tuple[np.ndarray, list[Fit]]:
+    """Fit the law of pressure: logs (3,) by which it changes, under which presses are most probable, and the fits."""
 
-    def surprise(fits: list[Fit], logs: np.ndarray, kept: list[int]) -> float:
-        return sum(fits[k].improbability for k in kept) + float(np.sum((logs / SPREAD) ** 2))
+    def deviance(fits: list[Fit], logs: np.ndarray, inliers: list[int]) -> float:
+        return sum(fits[k].deviance for k in inliers) + float(np.sum((logs / LAW_STD) ** 2))
 
-    fits = presses.under(logs).fits(starts)
-    for _ in range(STEPS):
+    fits = presses.with_law(logs).fits(starts)
+    for _ in range(MAX_STEPS):
         squares = np.array([fit.square for fit in fits])
-        kept = np.flatnonzero(squares <= UNUSUAL * np.median(squares)).tolist()
-        matrix, towards = presses.under(logs).normal(fits, kept)
-        step = np.linalg.solve(matrix + np.diag(SPREAD**-2.0), towards - logs / SPREAD**2)
-        step *= min(1, MOST_STEP / max(np.abs(step).max(), LEAST_STEP))
-        now, begin = surprise(fits, logs, kept), [fit.rows[:, :4] for fit in fits]
-        for _ in range(1 + HALVINGS):
-            found = presses.under(logs + step).fits(begin)
-            if surprise(found, logs + step, kept) < now:
+        inliers = np.flatnonzero(squares <= OUTLIER_RATIO * np.median(squares)).tolist()
+        matrix, gradient = presses.with_law(logs).normal_equations(fits, inliers)
+        step = np.linalg.solve(matrix + np.diag(LAW_STD**-2.0), gradient - logs / LAW_STD**2)
+        step *= min(1, MAX_STEP / max(np.abs(step).max(), MIN_STEP))
+        current, starts = deviance(fits, logs, inliers), [fit.rows[:, :4] for fit in fits]
+        for _ in range(1 + MAX_HALVINGS):
+            found = presses.with_law(logs + step).fits(starts)
+            if deviance(found, logs + step, inliers) < current:
                 break
             step /= 2
         else:
             return logs, fits
         logs, fits = logs + step, found
-        if np.abs(step).max() < LEAST_STEP:
+        if np.abs(step).max() < MIN_STEP:
             break
     return logs, fits
 
 
-def _force_law(presses: _Presses, starts: list[np.ndarray], counted: np.ndarray) -> ForceLaw:
-    """The law by which the forces of fits are told, by what fits of presses find where the force is not known."""
-    told = [presses.missed(k, starts[k]) for k in np.flatnonzero(counted).tolist()]
-    missed, variance, slopes = (np.array([one[part] for one in told]) for part in range(3))
-    return regressed_force_law(missed, variance, slopes)
+def _force_law(presses: _Presses, starts: list[np.ndarray], informative: np.ndarray) -> ForceLaw:
+    """The law of forces, by fits of presses as if their force were unknown."""
+    errors = [presses.force_error(k, starts[k]) for k in np.flatnonzero(informative).tolist()]
+    log_errors, variance, slopes = (np.array([one[part] for one in errors]) for part in range(3))
+    return fit_force_law(log_errors, variance, slopes)
 
 
-def regressed_force_law(
-    missed: Float[np.ndarray, " n"], variance: Float[np.ndarray, " n"], slopes: Float[np.ndarray, "n 3"]
+def fit_force_law(
+    log_errors: Float[np.ndarray, " n"], variance: Float[np.ndarray, " n"], slopes: Float[np.ndarray, "n 3"]
 ) -> ForceLaw:
-    """The law of forces under which those that fits find are least surprising.
+    """Fit the law of forces to errors of fitted forces, by a regression with errors of Student's law.
 
     Args:
-        missed, variance: logs of found forces over the true ones, and their variances, as fits state them.
-        slopes: of the logs of found forces in those of the law.
+        log_errors, variance: logs of fitted forces over the true ones, and their variances, as fits state them.
+        slopes: of the logs of fitted forces in those of the law.
     """
-    variance, weight = variance + FORCE_ERROR**2, np.ones(len(missed))
-    for _ in range(REWEIGHTED):
-        weighed = slopes * (weight / variance)[:, None]
-        covariance = inverse_of(slopes.T @ weighed + np.diag(FORCE_SPREAD**-2.0))[0]
-        logs = covariance @ weighed.T @ missed
-        squares = (missed - slopes @ logs) ** 2 / variance
-        weight = (FREEDOM + 1) / (FREEDOM + squares)
-    over = (STATED + float(weight @ squares)) / (STATED + len(missed))
-    return ForceLaw(tuple(logs.tolist()), tuple(map(tuple, covariance.tolist())), over)
+    variance, weight = variance + FORCE_ERROR**2, np.ones(len(log_errors))
+    for _ in range(REWEIGHTINGS):
+        weighted = slopes * (weight / variance)[:, None]
+        covariance = inverse_of(slopes.T @ weighted + np.diag(FORCE_LAW_STD**-2.0))[0]
+        logs = covariance @ weighted.T @ log_errors
+        squares = (log_errors - slopes @ logs) ** 2 / variance
+        weight = (DEGREES_OF_FREEDOM + 1) / (DEGREES_OF_FREEDOM + squares)
+    variance_ratio = (PRIOR_WEIGHT + float(weight @ squares)) / (PRIOR_WEIGHT + len(log_errors))
+    return ForceLaw(tuple(logs.tolist()), tuple(map(tuple, covariance.tolist())), variance_ratio)
 
 
 def _model_error(presses: _Presses, fits: list[Fit]) -> tuple[float, np.ndarray]:
@@ -286,8 +291,8 @@ def _model_error(presses: _Presses, fits: list[Fit]) -> tuple[float, np.ndarray]
 
     def evidence(own: np.ndarray, fit: Fit, error: float) -> float:
         frame = FrameFits(presses.with_error(error).belief, own)
-        return log_evidence(frame.belief, frame.fit(LoadKind.ONE, fit.rows[:, :4], LAST_FALL))
+        return log_evidence(frame.belief, frame.fit(LoadKind.ONE, fit.rows[:, :4], FINAL_FALL_ATOL))
 
-    each = [cache(partial(evidence, *one)) for one in zip(presses.y, fits, strict=True)]
-    error = fitted_model_error(each, float(presses.belief.model_error), SURELY)
-    return error, np.array([one(error) for one in each])
+    evidences = [cache(partial(evidence, *one)) for one in zip(presses.y, fits, strict=True)]
+    error = select_model_error(evidences, float(presses.belief.model_error), MIN_LOG_RATIO)
+    return error, np.array([one(error) for one in evidences])
