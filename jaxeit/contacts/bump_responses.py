@@ -13,7 +13,7 @@ Gaussian,
     g(p, s) g(q, t) = exp(-|p - q|^2 / 2(s^2 + t^2)) g((p t^2 + q s^2) / (s^2 + t^2), s t / sqrt(s^2 + t^2)),
 
 so that K contacts are K + K (K + 1) / 2 bumps.  The table holds cubic B-splines over place and log width, with exact
-derivatives, in the few directions of the whitened readings (`imaging.noise`) that bumps reach.
+derivatives, in the few directions of the whitened readings (`imaging.whitening`) that bumps reach.
 """
 
 import itertools

@@ -11,8 +11,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from .._compile import full_precision, require_known, verb
-from ..imaging.noise import InverseError, Whitened, whitened_readings
+from ..imaging.inputs import InverseError
 from ..imaging.untouched import sheet_of
+from ..imaging.whitening import Whitened, whitened_readings
 from ..model.bases import Elements
 from ..model.discretisation import Model, require_model
 from ..model.sensitivity import pair_jacobian

@@ -18,8 +18,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from .._compile import by_platform, sequential_on_cpu, usually, verb
+from ..imaging.inputs import require_frames
 from ..imaging.missing import gap_of, lost_of_frame
-from ..imaging.noise import Whitening, require_frames
+from ..imaging.whitening import Whitening
 from .bump_responses import Responses
 from .fit import ContactFit, FrameResponse, UnfinishedFit, one_row_each
 from .result import ContactResult, Contacts

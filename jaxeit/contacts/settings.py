@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ..imaging.noise import InverseError
+from ..imaging.inputs import InverseError
 from ..registry import limited, require_limits
 from ..registry.limits import LONGEST
 

@@ -34,6 +34,7 @@ from .hyperparameters import (
     NoiseFigure as NoiseFigure,
     PriorDeviation as PriorDeviation,
 )
+from .inputs import ConvergenceError as ConvergenceError, InverseError as InverseError
 from .level_set import LevelSet as LevelSet
 from .measured_noise import (
     NOISES as NOISES,
@@ -56,11 +57,7 @@ from .methods import (
     SparseBayes as SparseBayes,
     TruncatedSvd as TruncatedSvd,
 )
-from .noise import (
-    ConvergenceError as ConvergenceError,
-    InverseError as InverseError,
-    noise_covariance as noise_covariance,
-)
+from .noise import noise_covariance as noise_covariance
 from .preparation import prepare as prepare
 from .priors import (
     PRIORS as PRIORS,

@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 from .._compile import verb
 from ..linalg.lapack import eigh
 from ..registry import AbstractChoice, Registry, limited
+from .inputs import InverseError, require_real
 from .methods import Problem
-from .noise import InverseError, require_real
 
 # Takes frames, (..., readings) V, to whitened ones, (..., k).
 Whiten = Callable[[Array], Array]

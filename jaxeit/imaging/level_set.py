@@ -21,7 +21,7 @@ from ..least_squares.searches import HalfSquares
 from ..model.bases import Picture
 from ..registry import limited, require_limits
 from .absolute.images import IMAGE_STEPS, IMAGE_TOLERANCE, AbstractPosterior, ImagePosterior, Quadratic, most_probable
-from .noise import InverseError
+from .inputs import InverseError
 from .priors import AbstractPrior, Laplace
 
 FAR = 4.0

@@ -9,7 +9,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
 from ..registry import Registry
-from .noise import InverseError, noise_covariance, require_real
+from .inputs import InverseError, require_real
+from .noise import noise_covariance
 
 LEAST_DEVIATION = 0.1  # of the median deviation: a reading that hardly changes is not trusted more than tenfold
 

@@ -1,6 +1,6 @@
 """Readings that are missing from a frame: one algebra for JAX, NumPy, reconstructors and the contact finder.
 
-`noise` has the symbols: readings v = P z plus noise of inverse covariance W, their weighted sums t = P^T W v, and
+`whitening` has the symbols: readings v = P z plus noise of inverse covariance W, their weighted sums t = P^T W v, and
 G = P^T W P. T is the matrix that predicts pair sums, ``z = T t``, from the one-step image. The missing readings m hold
 zero in v.
 `Missing` describes them as b = B z plus independent noise of weight w, with what the other readings say about them
@@ -30,7 +30,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..linalg.array_libraries import JAX, ArrayLibrary
 from ..linalg.lapack import eigh
-from .noise import Whitening
+from .whitening import Whitening
 
 # Missing readings up to which JAX gathers their rows of P, for a system of this size; with more it solves one in all
 # pair sums. A compiled program needs a fixed number.

@@ -9,8 +9,9 @@ from jaxtyping import Array, Float
 from scipy.sparse import csr_array
 
 from ..linalg.array_libraries import NUMPY
+from .inputs import require_frames
 from .missing import Missing, PairRows, completed_sums, correlated, removed
-from .noise import Whitening, require_frames
+from .whitening import Whitening
 
 
 class NumpyImages:

@@ -19,12 +19,13 @@ from ..model.bases import AbstractBasis, BasisMap, Pixels
 from ..model.discretisation import Model, require_model
 from ..model.sensitivity import pair_jacobian
 from .hyperparameters import AbstractHyperparameter, HyperparameterError, spectrum
+from .inputs import InverseError
 from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem
 from .methods.one_step import one_step_image
-from .noise import InverseError, Whitened, Whitening, whitened_readings
 from .priors import AbstractPrior, Noser
 from .reconstruction import IterativeReconstructor, Provenance, Reconstructor
 from .untouched import sheet_of
+from .whitening import Whitened, Whitening, whitened_readings
 
 T = TypeVar("T")
 
@@ -280,7 +281,7 @@ def _stated(choice: Any) -> str:
 
 
 def _rank(found: Whitened, followed: Float[Array, "r k"]) -> str:
-    """``tr(J Q)``: with E and C of `noise` it is the trace of ``(J Q E) C^T``."""
+    """``tr(J Q)``: with E and C of `whitening` it is the trace of ``(J Q E) C^T``."""
     if is_traced(found.factor, followed):
         return _TRACED
     return f"{np.sum(found.factor * np.asarray(followed, float)):.3g} of {len(found.factor)}"

@@ -17,10 +17,11 @@ from .._compile import compiler_options, full_precision, is_traced, require_know
 from ..linalg.array_libraries import JAX
 from ..model.bases import AbstractPictured, Picture
 from ..notebook import card, picture
+from .inputs import InverseError, as_flags, require_frames, require_some
 from .methods import AbstractIterativeMethod, Problem
 from .missing import mended_sums, removed, without_readings
-from .noise import InverseError, Whitening, as_flags, require_frames, require_some
 from .numpy_images import NumpyImages
+from .whitening import Whitening
 
 
 class Provenance(dict[str, str]):
@@ -167,7 +168,7 @@ def _matrix(factor: Float[Array, "basis k"], whitening: Whitening, readings: int
 
 
 class Reconstructor(AbstractReconstructor):
-    """A linear reconstruction, ``image = Q dv``, kept as ``Q = factor P^T W`` (see `noise`).
+    """A linear reconstruction, ``image = Q dv``, kept as ``Q = factor P^T W`` (see `whitening`).
 
     | meaning                                                                          | shape      | unit |
     |----------------------------------------------------------------------------------|------------|------|

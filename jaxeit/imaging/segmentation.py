@@ -31,8 +31,8 @@ from .absolute.images import (
     reading_weights,
 )
 from .absolute.one_frame import believed_image, picture_basis, variation_of
+from .inputs import InverseError
 from .level_set import LevelSet, fitted_level, signed_distances
-from .noise import InverseError
 
 UNCHANGED, RESISTIVE, CONDUCTIVE = 0, 1, 2
 """The classes."""

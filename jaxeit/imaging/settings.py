@@ -10,9 +10,9 @@ from ..kinds import require_kind
 from ..model.bases import BASES, AbstractBasis, Pixels
 from ..model.discretisation import Model
 from .hyperparameters import HYPERPARAMETERS, AbstractHyperparameter
+from .inputs import InverseError
 from .measured_noise import NOISES, AbstractNoise, EqualNoise
 from .methods import METHODS, AbstractIterativeMethod, AbstractLinearMethod, OneStep
-from .noise import InverseError
 from .preparation import Settings, prepare, require_choices
 from .priors import PRIORS, AbstractPrior, Noser
 from .reconstruction import IterativeReconstructor, Reconstructor

@@ -9,7 +9,7 @@ from ..kinds import stated
 from ..model.discretisation import Model
 from ..model.forward_model import CoatedSheet
 from . import absolute  # which is imported on first use, since its solvers take a tenth of a second
-from .noise import InverseError, require_real
+from .inputs import InverseError, require_real
 
 
 def sheet_of(

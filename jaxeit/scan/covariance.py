@@ -17,8 +17,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from .._compile import verb
+from ..imaging.inputs import InverseError, known_flags, require_some
 from ..imaging.methods import Problem
-from ..imaging.noise import InverseError, known_flags, noise_weight, require_some
+from ..imaging.noise import noise_weight
 from ..imaging.priors import AbstractPrior, Noser
 from ..model.bases import AbstractBasis, BasisMap, Picture, Pixels
 from ..model.discretisation import Model

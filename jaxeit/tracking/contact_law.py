@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..contacts.loads.settings import LoadSettings
-from ..imaging.noise import InverseError
+from ..imaging.inputs import InverseError
 from .tracks import Track
 
 # Prior standard deviations of a, b and c, and prior scatter of e, which counts as `PRIOR_SHAPE` times two contacts.

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from .._compile import require_known
 from ..contacts.loads.learned.model_error import select_model_error
-from ..imaging.noise import InverseError, require_real
+from ..imaging.inputs import InverseError, require_real
 from ..kinds import require_unmasked
 from .belief.filter import Pads
 from .belief.layer import LearnedLayer

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from ..contacts.loads import LoadSettings
-from ..imaging.noise import InverseError
+from ..imaging.inputs import InverseError
 from ..kinds import require_kind
 from ..model.fidelity import Fidelity
 from ..registry import limited, require_limits

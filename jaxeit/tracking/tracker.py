@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._compile import require_known
 from ..imaging.absolute.background import UntouchedSheet, fitted_sheet
-from ..imaging.noise import InverseError, require_real
+from ..imaging.inputs import InverseError, require_real
 from ..imaging.untouched import untouched_frame
 from ..kinds import require_unmasked
 from ..model.discretisation import Model, require_model

@@ -10,7 +10,7 @@ from scipy.stats import binom
 import jaxeit as je
 from jaxeit.contacts import ContactResult, ContactSettings, prepare_contacts, refine_contacts, search, strongest
 from jaxeit.contacts.bump_responses import nodes_of, points_of, tabulate
-from jaxeit.imaging.noise import InverseError
+from jaxeit.imaging.inputs import InverseError
 
 from ..helpers import spread_stacks
 

@@ -11,8 +11,8 @@ from scipy.optimize import nnls
 
 import jaxeit as je
 from jaxeit.imaging.hyperparameters import spectrum
+from jaxeit.imaging.inputs import InverseError
 from jaxeit.imaging.methods import Problem
-from jaxeit.imaging.noise import InverseError
 from jaxeit.imaging.preparation import check_range
 from jaxeit.model.bases import Picture
 

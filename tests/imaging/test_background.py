@@ -8,7 +8,7 @@ import pytest
 
 import jaxeit as je
 from jaxeit.imaging.absolute.background import coat_precision, even_coat, fit_background, fitted_sheet
-from jaxeit.imaging.noise import InverseError
+from jaxeit.imaging.inputs import InverseError
 
 from ..helpers import require_identical, square_model
 

@@ -22,7 +22,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..._compile import require_known
-from ...imaging.noise import InverseError, Whitening, require_real
+from ...imaging.inputs import InverseError, require_real
+from ...imaging.whitening import Whitening
 from ..result import Contacts
 from .belief import LoadBelief
 from .fits import FrameFits

@@ -9,7 +9,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from ..._compile import verb
-from ...imaging.noise import Whitening
+from ...imaging.whitening import Whitening
 from ...least_squares import ImplicitStep, normal_equations
 from ...least_squares.searches import HalfSquares
 from ...linalg import lapack

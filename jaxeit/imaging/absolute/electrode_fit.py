@@ -33,7 +33,7 @@ from ...model.motion import Motion, electrode_motion, field_shift_jacobian, move
 from ...model.sensitivity import field_jacobian, field_slope, scaled_jacobian
 from ...registry import AbstractChoice, limited
 from ...registry.limits import LONGEST
-from ..noise import InverseError
+from ..inputs import InverseError
 from ..priors import GaussianSmooth
 from .background import COATING_LENGTH, COATING_STD
 from .frames import checked_frame, frame_error, sheet_level

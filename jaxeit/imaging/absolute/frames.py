@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from ..._compile import is_traced, verb
-from ..noise import InverseError, require_real
+from ..inputs import InverseError, require_real
 
 # Smallest error of a reading, as a fraction of the root mean square of all: no reading is modelled better.
 ERROR_FLOOR = 1e-3

@@ -22,7 +22,7 @@ from ...model.discretisation import Model
 from ...model.forward_model import forward, terminal_matrix, voltages
 from ...model.sensitivity import field_jacobian, scaled_jacobian, solved_fields
 from ...registry import AbstractChoice, limited
-from ..noise import InverseError, require_real
+from ..inputs import InverseError, require_real
 from ..priors import AbstractPrecision
 from .frames import checked_errors, require_steps
 

@@ -28,7 +28,7 @@ from ...model.discretisation import Model
 from ...model.forward_model import Coefficients, Fields, terminal_matrix, voltages
 from ...model.motion import Motion, electrode_motion, field_shift_jacobian
 from ...model.sensitivity import field_jacobian, solved_fields
-from ..noise import InverseError, real_numbers
+from ..inputs import InverseError, real_numbers
 from .background import (
     COATING_COLUMNS,
     COATING_ERROR,

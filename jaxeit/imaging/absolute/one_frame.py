@@ -12,7 +12,7 @@ from ..._compile import require_known
 from ...model.bases import AbstractBasis, BasisMap, Picture, Pixels
 from ...model.discretisation import Model, require_model
 from ...model.forward_model import forward
-from ..noise import InverseError
+from ..inputs import InverseError
 from .frames import checked_frame, frame_error, require_positive, sheet_level
 from .images import AbstractPenalty, IsotropicVariation, LogConductivity, gauss_newton_fit
 

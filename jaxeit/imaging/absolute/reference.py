@@ -32,7 +32,7 @@ from ...model.forward_model import forward
 from ...model.motion import Motion, electrode_motion, moved
 from ...registry import limited, require_limits
 from ...registry.limits import LONGEST
-from ..noise import ConvergenceError, InverseError, require_real
+from ..inputs import ConvergenceError, InverseError, require_real
 from .frames import MAX_UNEXPLAINED, checked_errors, checked_frame, frame_error, require_explained, sheet_level
 from .images import reading_weights
 

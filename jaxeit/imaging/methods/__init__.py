@@ -1,6 +1,6 @@
 """Methods of reconstruction: how data and prior are weighed against each other.
 
-All work on whitened readings y (`noise`), of independent noise of one size, with the Jacobian J of y:
+All work on whitened readings y (`whitening`), of independent noise of one size, with the Jacobian J of y:
 
     x = argmin |J x - y|^2 + l^2 x^T R x,        l^2 = hyperparameter^2 tr(J R^-1 J^T) / readings.
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from ...model.bases import Picture
 from ...registry import AbstractChoice
-from ..noise import InverseError
+from ..inputs import InverseError
 from ..priors import AbstractPrecision, AbstractPrior
 
 

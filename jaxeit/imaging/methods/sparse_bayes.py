@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from ...linalg.lapack import cho_solve, cholesky, solve_triangular
 from ...registry import limited
-from ..noise import InverseError
+from ..inputs import InverseError
 from ..priors import Diagonal
 from .base import AbstractIterativeMethod, Problem
 

@@ -19,7 +19,7 @@ from scipy.special import softmax
 
 from ...contacts.loads.settings import LoadSettings
 from ...contacts.loads.sheet import AbstractGain
-from ...imaging.noise import InverseError
+from ...imaging.inputs import InverseError
 from ...model.gaussian_field import field_bumps, field_nodes, field_norm
 
 # Relative tolerance within which two fields count as equal; of places, relative to the length of the field.

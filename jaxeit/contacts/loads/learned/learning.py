@@ -33,7 +33,7 @@ from jaxtyping import Array, Bool, Float
 from scipy.linalg import solve_triangular
 
 from ...._compile import require_known
-from ....imaging.noise import InverseError, require_real
+from ....imaging.inputs import InverseError, require_real
 from ....kinds import require_unmasked
 from ....model.discretisation import Model
 from ..belief import LoadBelief

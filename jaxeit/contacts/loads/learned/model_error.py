@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ....imaging.noise import InverseError
+from ....imaging.inputs import InverseError
 
 # Ratio of consecutive model errors in the search, and its first and last error.
 ERROR_RATIO, MIN_ERROR, MAX_ERROR = 2**0.5, 1e-3, 0.15

@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
 from ....array_files import read_arrays, write_arrays
-from ....imaging.noise import InverseError, require_real
+from ....imaging.inputs import InverseError, require_real
 from ....kinds import require_unmasked
 from ....skin import Skin, skin_hash
 from ..pressure import FORMS
