@@ -150,10 +150,6 @@ def _tasks(
     recipe: Recipe,
     ignore_errors: bool,
 ) -> list[_Task]:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SessionError(f"{out}: no folder can be made there ({error.strerror}); choose another") from error
     mark = digest(recipe.to_toml(), describe(skin), str(ignore_errors), je.__version__, jax.__version__)
     shared: dict[str, Any] = {
         "report": report,
@@ -174,6 +170,10 @@ def _tasks(
         if os.path.abspath(out / name) == session:
             raise SessionError(f"{session}: its result would take its place; choose another folder for the output")
         tasks.append(_Task(session, os.path.abspath(out / name), **shared))
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SessionError(f"{out}: no folder can be made there ({error.strerror}); choose another") from error
     return tasks
 
 

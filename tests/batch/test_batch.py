@@ -146,6 +146,7 @@ def test_wrong_inputs_are_one_clear_line(sessions, tmp_path, monkeypatch):
     other.mkdir()
     with pytest.raises(calib.SessionError, match=r"its result would be s0\.h5, as that of"):
         batch.calibrate_many([sessions[0], other / "s0.h5"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
     with pytest.raises(calib.SessionError, match="would take its place"):
         batch.calibrate_many(sessions, tmp_path / "sessions")
     with pytest.raises(calib.SessionError, match="no folder can be made there"):
