@@ -11,7 +11,7 @@ import jaxeit as je
 from .bench import Bench, BenchError
 
 # Distances from the tip's centre, m, of the points of the integral, and their number; directions at each distance.
-NEAREST, FARTHEST, DISTANCES, DIRECTIONS = 1e-6, 1.0, 1000, 32
+NEAREST, FARTHEST, DISTANCES, DIRECTIONS = 1e-6, 1.0, 500, 32
 CHECKED_PLACES = 8  # of a bench, evenly among its sites
 MAX_ERROR = 0.25  # of the force on the mesh, at half of the places: single places err more where a tip is flat
 
