@@ -51,7 +51,8 @@ def apply(
     By the calibration of a log, write its forces over time, as `calib.calibration.apply_log` does, which returns them.
 
     The file, format skin-forcemap, appears only when complete. Where the pads disagree with the image, intervals are
-    wider by as much. What lies outside of what was calibrated is told, and stands in the file's attribute "outside".
+    wider by as much. What lies outside of what was calibrated is told, and stands in the file's attribute "outside";
+    warnings of `check_session` about the skin, frames and pressures in "warnings".
 
     Args:
         processing: how the session is corrected; default: as the sessions of the calibration.
@@ -64,7 +65,8 @@ def apply(
             unless a proposal is given, since the shipped ones were trained on the usual loads.
         track: also follow contacts from frame to frame, each with a number, smoothed over time; by the usual settings
             or by these.
-        tell: called with a line about loads, about contacts, and about each thing outside of what was calibrated.
+        tell: called with a line about loads, about contacts, about each warning and each thing outside of what was
+            calibrated.
 
     Raises:
         SessionError: if the session was recorded on another skin, lacks a stream, or holds no frame.
@@ -74,17 +76,22 @@ def apply(
     require_session(session, "apply")
     if isinstance(calibration, LogCalibration):
         require_no_eit_choices("apply", processing=processing, loads=loads, load_settings=load_settings, track=track)
-        return _write_log_forces(calibration, session, path, ignore_errors, tell)
+        apply_log(calibration, session, path, ignore_errors=ignore_errors, tell=tell)
+        return Path(path)
     require_calibration(calibration, "apply")
     processing = processing or calibration.processing
     proposed = None if loads is None else chosen_proposal(proposal, calibration.skin, tell, load_settings)
     levels = resting_levels(session, calibration.skin, processing)
-    ignored = accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED_PARTS)
+    found = accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED_PARTS)
     calibration, outside = _agreement(calibration, session, levels)
-    attrs = _attributes(calibration, session) | {"ignored_errors": "\n".join(ignored), "outside": "\n".join(outside)}
+    attrs = _attributes(calibration, session) | {
+        "ignored_errors": "\n".join(found.ignored),
+        "warnings": "\n".join(found.warnings),
+        "outside": "\n".join(outside),
+    }
     if loads is not None and load_settings is not None:
         attrs["load_settings"] = load_settings.changed()
-    for line in outside:
+    for line in (*found.warnings, *outside):
         tell(f"note: {line}")
     blocks = FrameBlocks(session, processing, levels)
     with ArchiveWriter(path, FORCE_MAP_FORMAT, {name: value for name, value in attrs.items() if value != ""}) as writer:
@@ -95,26 +102,12 @@ def apply(
             also += [_Loads(calibration, writer, loads, fit)]
         usual = track if isinstance(track, je.tracking.TrackerSettings) else None
         also += [_Tracks(calibration, writer, blocks, usual, tell)] if track else []
-        for block, found in estimated(calibration, progress(blocks)):
-            _append(writer, _of_block(block.time, found, calibration.pads.multiple), kinds)
+        for block, estimate in estimated(calibration, progress(blocks)):
+            _append(writer, _of_block(block.time, estimate, calibration.pads.multiple), kinds)
             for one in also:
-                one.add(block, found)
+                one.add(block, estimate)
         for one in also:
             tell(one.end())
-    return Path(path)
-
-
-def _write_log_forces(
-    calibration: LogCalibration,
-    session: Session,
-    path: str | Path,
-    ignore_errors: bool,
-    tell: Callable[[str], object],
-) -> Path:
-    """`apply` for the calibration of a log."""
-    found = apply_log(calibration, session, path, ignore_errors=ignore_errors)
-    if unseen := calibration.unseen(found.force):
-        tell(f"note: {unseen}")
     return Path(path)
 
 

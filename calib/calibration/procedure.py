@@ -10,7 +10,7 @@ import numpy as np
 
 import jaxeit as je
 
-from ..check.acceptance import accept
+from ..check.acceptance import Acceptance, accept
 from ..fitting.cross_validation.neighbourhoods import with_error_scale
 from ..fitting.fields import single_places
 from ..fitting.fields.unpressed_walls import unpressed_note
@@ -87,9 +87,9 @@ def calibrate(
     skin = skin or _one_skin(sessions)
     progress("reading")
     presses = pool_presses(sessions, skin, recipe.processing)
-    ignored = accept(sessions, skin, ignore_errors=ignore_errors)
+    accepted = accept(sessions, skin, ignore_errors=ignore_errors)
     require_every_pad_pressed(skin, presses.data)
-    calibration = _calibration(sessions, _found(skin, presses, recipe, progress), recipe, ignored)
+    calibration = _calibration(sessions, _found(skin, presses, recipe, progress), recipe, accepted)
     if recipe.learn_layer:
         progress(LEARNING)
         for session in sessions:
@@ -151,7 +151,7 @@ def _found(skin: je.Skin, presses: PooledPresses, recipe: Recipe, progress: Call
     return _Found(skin, placed, presses, imager, images, response, held_out)
 
 
-def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ignored: tuple[str, ...]) -> Calibration:
+def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, accepted: Acceptance) -> Calibration:
     presses, imager, response = found.presses, found.imager, found.response
     choice, model = response.choice, with_error_scale(response.model, found.held_out.error_scale)
     evaluation = _held_out_evaluation(found)
@@ -160,9 +160,9 @@ def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, ign
         recon=imager.recon,
         masks=imager.masks,
         curves=model.curves,
-        notes=(*ignored, *_notes(found, evaluation)),
+        notes=(*accepted.notes, *_notes(found, evaluation)),
         evaluation=evaluation,
-        provenance=_provenance(sessions, recipe, imager, response, ignored),
+        provenance=_provenance(sessions, recipe, imager, response, accepted.ignored),
         simulated=any(s.simulated for s in sessions),
         field=model.field,
         crosstalk=presses.crosstalk,
@@ -307,7 +307,7 @@ def _evaluation(calibration: Calibration, session: Session, processing: Processi
     """`evaluate` for the calibration of a skin."""
     found = measure(session, calibration.skin, processing)
     fitted = is_fitted(calibration.provenance, session) or holds_presses(calibration, found.force, found.pressure)
-    ignored = accept([session], calibration.skin, ignore_errors=ignore_errors)
+    accepted = accept([session], calibration.skin, ignore_errors=ignore_errors)
     _require_channels(calibration, found)
     images = Imager(calibration.recon, calibration.masks, calibration.locator).presses(found.dv)
     agreement = agreement_of_presses(calibration, found, images)
@@ -322,7 +322,7 @@ def _evaluation(calibration: Calibration, session: Session, processing: Processi
         image_sum=images.integral,
         centre=centre_of(calibration.skin),
         held_out_by="" if fitted else "session",
-        notes=(*([FITTED_NOTE] if fitted else []), *ignored, *found.notes, *agreement.notes),
+        notes=(*([FITTED_NOTE] if fitted else []), *accepted.notes, *found.notes, *agreement.notes),
         others=_compared_forces(calibration, found, images.integral),
         recipe=calibration.evaluation.recipe,
     )

@@ -1,6 +1,10 @@
-"""Decide whether a session may be used: an error of `check_session` is refused, or noted if the user allows it."""
+"""Decide whether a session may be used: an error of `check_session` is refused, or noted if the user allows it.
+
+Warnings are noted, so that whoever uses a session reads what `jaxeit check` says of it.
+"""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jaxeit as je
 
@@ -15,15 +19,32 @@ class RecordingError(SessionError):
     """A recording contains values that cannot be true, so that results computed from it would be wrong."""
 
 
+# Parts of a session whose warnings are noted. Commands note presses that are set aside, the recorder its faults.
+NOTED_PARTS = ("/device", "/streams")
+
+
+class Acceptance(NamedTuple):
+    """What is to be noted of sessions that are used: their errors, if these are ignored, and their warnings."""
+
+    ignored: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The errors, then the warnings."""
+        return self.ignored + self.warnings
+
+
 def accept(
     sessions: Sequence[Session], skin: je.Skin | None, *, ignore_errors: bool = False, where: Sequence[str] = ("",)
-) -> tuple[str, ...]:
-    """Check sessions before they are used; returns their errors as notes if errors are ignored, otherwise no notes.
+) -> Acceptance:
+    """Check sessions before they are used; returns their warnings, and their errors if errors are ignored, as notes.
 
     Args:
         skin: the skin with which the sessions are used; None: the skin of each session.
         ignore_errors: return errors as notes instead of raising.
-        where: beginnings of the places in a file whose errors count, such as "/streams/eit"; default: all.
+        where: beginnings of the places in a file that are used, such as "/streams/eit"; default: all. Errors and
+            warnings elsewhere do not count.
 
     Raises:
         RecordingError: naming the first error of the first session that has one, and how many more there are.
@@ -31,6 +52,7 @@ def accept(
     Example:
         try:
             with calib.open_session("session.h5") as session:
+                print(calib.check.accept([session], None).warnings)
                 calib.check.accept([session], je.load_skin("chest"))  # another skin
         except calib.check.RecordingError as error:
             print(error)
@@ -41,19 +63,29 @@ def accept(
             transfer = transfer_matrix(skin)
         except ValueError:  # the check names it
             transfer = None
-    notes: list[str] = []
+    ignored: list[str] = []
+    warnings: list[str] = []
     for session in sessions:
-        findings = check_session(session, skin, transfer=transfer).findings
-        errors = [f for f in findings if f.severity is Severity.ERROR and f.where.startswith(tuple(where))]
+        findings = [
+            f for f in check_session(session, skin, transfer=transfer).findings if f.where.startswith(tuple(where))
+        ]
+        errors = [f for f in findings if f.severity is Severity.ERROR]
         if errors and not ignore_errors:
             raise RecordingError(_refusal(session, errors))
-        notes += [f"{printable(session.name)}: error ignored: {printable(f'{f.where}: {f.what}', 300)}" for f in errors]
-    return tuple(notes)
+        name = printable(session.name)
+        ignored += [f"{name}: error ignored: {printable(f'{f.where}: {f.what}', 300)}" for f in errors]
+        warned = [f for f in findings if f.severity is Severity.WARNING and f.where.startswith(NOTED_PARTS)]
+        warnings += [f"{name}: {_said(f)}" for f in warned]
+    return Acceptance(tuple(ignored), tuple(warnings))
+
+
+def _said(finding: Finding) -> str:
+    """A finding and what to do, in one line."""
+    return printable(f"{finding.where}: {finding.what}; {finding.remedy}", 600)
 
 
 def _refusal(session: Session, errors: Sequence[Finding]) -> str:
     first, name = errors[0], printable(session.name)
     others = counted(len(errors) - 1, "more error")
     more = f" ({others}: jaxeit check)" if others else ""
-    said = printable(f"{first.where}: {first.what}; {first.remedy}", 600)
-    return f"{name}: {said}{more}; or use the session all the same (--force, ignore_errors=True)"
+    return f"{name}: {_said(first)}{more}; or use the session all the same (--force, ignore_errors=True)"

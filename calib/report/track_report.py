@@ -63,7 +63,8 @@ def _page(rows: Rows, told: list[str], attrs: Mapping[str, Any], skin: je.Skin) 
     parts = [f"<h1>{escape(title)}</h1>"]
     if simulated:
         parts.append('<p class="banner" role="note"><strong>SIMULATED</strong> The recording is simulated.</p>')
-    parts += [f"<p>Note: {escape(line)}</p>" for line in str(attrs.get("outside", "")).split("\n") if line]
+    noted = "\n".join(str(attrs.get(name, "")) for name in ("warnings", "outside"))
+    parts += [f"<p>Note: {escape(line)}</p>" for line in noted.split("\n") if line]
     if not rows or not len(rows["time"]):
         parts += [] if told else ["<p>No contact was followed.</p>"]
     else:

@@ -121,6 +121,40 @@ def test_apply_does_not_mind_the_force(calibration, honest, folder, tmp_path, ca
     assert "none of 16 presses can be used: no force; see jaxeit check" in capsys.readouterr().err
 
 
+@pytest.fixture(scope="module")
+def warned(honest, folder):
+    """Voltages at ten times the gain, which `check` warns of."""
+    return honest.change("eit", 10 * honest.values("eit")).write(folder / "loud.h5")
+
+
+WARNING = "loud.h5: /streams/eit: the amplitude is"
+
+
+def test_what_check_warns_of_is_said_once_and_kept_in_the_force_map(calibration, warned, folder, tmp_path, capsys):
+    made, out = str(folder / "calibration.h5"), str(tmp_path / "map.h5")
+    for command in (["apply", made, str(warned), "-o", out], ["evaluate", made, str(warned)]):
+        assert main(command) == 0
+        assert capsys.readouterr().out.count(f"note: {WARNING}") == 1
+    assert read_archive(out, "skin-forcemap").attrs["warnings"].startswith(WARNING)
+
+
+def test_what_check_warns_of_is_a_note_of_calibrations_too(calibration, warned, tmp_path, capsys):
+    command = ["recalibrate", str(warned.parent / "calibration.h5"), str(warned), "-o", str(tmp_path / "m.h5")]
+    main([*command, "--force"])
+    assert capsys.readouterr().out.count(WARNING) == 1
+    assert not any(note.startswith("sound.h5: /") for note in calibration.notes)
+    with open_session(warned) as session:
+        notes = calib.calibrate([session], recipe=QUICK).notes
+    assert sum(note.startswith(WARNING) for note in notes) == 1
+
+
+def test_nothing_is_said_of_an_honest_session(calibration, sound, folder, tmp_path, capsys):
+    out = str(tmp_path / "map.h5")
+    assert main(["apply", str(folder / "calibration.h5"), str(sound), "-o", out]) == 0
+    assert "note: sound.h5: /" not in capsys.readouterr().out
+    assert "warnings" not in read_archive(out, "skin-forcemap").attrs
+
+
 class Here(Executor):
     """Works at once, in this process."""
 

@@ -5,7 +5,7 @@ influence on the choice. The calibration that is kept is the chosen kind of mode
 """
 
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,8 +17,9 @@ import jaxeit as je
 from jaxeit.budget import current_budget
 from jaxeit.kinds import require_kind
 
-from ...check.acceptance import accept
+from ...check.acceptance import Acceptance, accept
 from ...check.logs.blocks import NOT_SIGNALS, signal_name
+from ...check.presses.pads import LEFT_OUT
 from ...fitting.curves import CURVES, AbstractCurve
 from ...fitting.fields import FIELDS, AbstractField, PadEdge
 from ...fitting.logs import (
@@ -82,7 +83,7 @@ def calibrate_logs(
         raise SessionError("calibrate_logs: no session given; give one or more logs")
     require_each_once(sessions)
     recipe = recipe_or_default(recipe, "calibrate_logs")
-    ignored = accept(sessions, None, ignore_errors=ignore_errors)
+    accepted = accept(sessions, None, ignore_errors=ignore_errors)
     signal = _same_signal(sessions)
     series, locations, placed = _with_places(_series(sessions, recipe), recipe, sessions)
     where = f"{sessions[0].name}: /streams/{signal.name}"
@@ -100,10 +101,21 @@ def calibrate_logs(
         stream=signal.name,
         unit=_unit(signal),
         evaluation=_second_halves(sessions, series, half, thin),
-        provenance=_provenance(sessions, recipe, half, ignored),
+        provenance=_provenance(sessions, recipe, half, accepted.ignored),
         simulated=any(s.simulated for s in sessions),
         notes=tuple(
-            filter(None, [*ignored, note, placed, thin, missing_direction(whole.model.travel), _of_images(recipe)])
+            filter(
+                None,
+                [
+                    *accepted.ignored,
+                    *_warnings(accepted),
+                    note,
+                    placed,
+                    thin,
+                    missing_direction(whole.model.travel),
+                    _of_images(recipe),
+                ],
+            )
         ),
         why=half.why,
         tried=half.tried,
@@ -290,6 +302,11 @@ def stream_of(calibration: LogCalibration, session: Session, call: str) -> Strea
     return signal
 
 
+def _warnings(accepted: Acceptance) -> Iterator[str]:
+    """Warnings about the logs of a calibration, but for channels that it leaves out, which it notes itself."""
+    return (line for line in accepted.warnings if not line.endswith(LEFT_OUT))
+
+
 def evaluate_log(calibration: LogCalibration, session: Session, *, ignore_errors: bool = False) -> LogEvaluation:
     """Evaluate a calibration on another log.
 
@@ -298,7 +315,7 @@ def evaluate_log(calibration: LogCalibration, session: Session, *, ignore_errors
         RecordingError: if `check_session` finds an error in the session, unless errors are ignored.
     """
     signal = stream_of(calibration, session, "evaluate_log")
-    ignored = accept([session], None, ignore_errors=ignore_errors)
+    accepted = accept([session], None, ignore_errors=ignore_errors)
     found = _predicted(calibration, session, signal)
     force = session.stream("force")
     numbers = (found.force, found.standard_error, found.low, found.high)
@@ -307,7 +324,7 @@ def evaluate_log(calibration: LogCalibration, session: Session, *, ignore_errors
     at_force = LogPrediction(predicted, error, low, high, found.valid[nearest] & np.isfinite(predicted))
     recorded = force.read()[:, 0]
     fitted = FITTED_NOTE if is_fitted(calibration.provenance, session) else ""
-    notes = tuple(filter(None, [fitted, *ignored, calibration.unseen(recorded)]))
+    notes = tuple(filter(None, [fitted, *accepted.notes, calibration.unseen(recorded)]))
     return log_evaluation(session.name, force.time, recorded, at_force, notes)
 
 
@@ -317,16 +334,25 @@ def _predicted(calibration: LogCalibration, session: Session, signal: Stream) ->
 
 
 def apply_log(
-    calibration: LogCalibration, session: Session, path: str | Path, *, ignore_errors: bool = False
+    calibration: LogCalibration,
+    session: Session,
+    path: str | Path,
+    *,
+    ignore_errors: bool = False,
+    tell: Callable[[str], object] = lambda line: None,
 ) -> LogPrediction:
     """Write force, standard error, interval and validity at the times of the signal, in the format log-forces.
+
+    Args:
+        tell: called with a line about each warning of `check_session` about that stream, and about forces that the
+            calibration has not seen; both stand in the file's attributes "warnings" and "note".
 
     Raises:
         SessionError: if the stream of the signal is missing, or the sensor is another.
         RecordingError: if `check_session` finds an error in that stream, unless errors are ignored.
     """
     signal = stream_of(calibration, session, "apply_log")
-    ignored = accept([session], None, ignore_errors=ignore_errors, where=(f"/streams/{signal.name}",))
+    accepted = accept([session], None, ignore_errors=ignore_errors, where=(f"/streams/{signal.name}",))
     found = _predicted(calibration, session, signal)
     attrs: dict[str, str | int] = {
         "session": session.name,
@@ -335,10 +361,13 @@ def apply_log(
         "time_epoch_utc": session.epoch,
         "calibration_created_utc": calibration.provenance["created_utc"],
     }
-    attrs |= {"ignored_errors": "\n".join(ignored)} if ignored else {}
-    attrs["note"] = calibration.unseen(found.force)
+    told = {"ignored_errors": accepted.ignored, "warnings": accepted.warnings}
+    attrs |= {name: "\n".join(lines) for name, lines in told.items() if lines}
+    attrs["note"] = unseen = calibration.unseen(found.force)
     arrays = _force_arrays(signal.time, session.epoch, found)
     write_archive(path, FORCE_FORMAT, attrs, arrays, dict.fromkeys(arrays, ("time",)))
+    for line in filter(None, (*accepted.warnings, unseen)):
+        tell(f"note: {line}")
     return found
 
 

@@ -20,7 +20,7 @@ def assess_log(
 ) -> LogShift:
     """How far a log with known force is off a calibration; arguments and errors as for `recalibrate_log`."""
     signal = stream_of(calibration, session, "assess_log")
-    ignored = accept([session], None, ignore_errors=ignore_errors)
+    accepted = accept([session], None, ignore_errors=ignore_errors)
     places = [place_of(session, session.stream("force").time)] if calibration.needs_place else None
     series = series_of([log_of(session)], places=places)
     found = replace(calibration, shift=None).predict(series.time, series.values, series.place)
@@ -48,7 +48,7 @@ def assess_log(
         until=session.epoch,
         notes=(
             *([SAME_NOTE] if is_fitted(calibration.provenance, session) else []),
-            *ignored,
+            *accepted.notes,
             *_left_out(series.complete, found.valid),
         ),
     )

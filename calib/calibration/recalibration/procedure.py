@@ -138,7 +138,7 @@ class KnownForces(AbstractEvidence):
 
     def read(self, calibration: Calibration, session: Session, ignore_errors: bool) -> tuple[LoadedPads, list[str]]:
         found = measure(session, calibration.skin, calibration.processing, place_needed=False)
-        notes = list(accept([session], calibration.skin, ignore_errors=ignore_errors, where=_parts(session)))
+        notes = list(accept([session], calibration.skin, ignore_errors=ignore_errors, where=_parts(session)).notes)
         images = _imager(calibration).presses(found.dv)
         known = np.isfinite(found.position).all(1, keepdims=True)
         place = np.where(known, found.position, images.estimated[estimator_of(calibration)])
@@ -171,7 +171,7 @@ class OrdinaryUse(AbstractEvidence):
 
     def read(self, calibration: Calibration, session: Session, ignore_errors: bool) -> tuple[LoadedPads, list[str]]:
         require_skin(session, calibration.skin, {name: session.stream(name) for name in ("eit", "pressure")})
-        notes = list(accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED_PARTS))
+        notes = list(accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED_PARTS).notes)
         return use_loads(calibration, session), notes
 
     def update(self, calibration: Calibration, loads: LoadedPads, noise: PressNoise) -> GainUpdate:

@@ -15,6 +15,7 @@ from ..streams.statistics import MAX_MISSING, StreamStatistics
 MIN_PRESSURE = 5.0  # Pa; no press is lighter, but bar and kPa recorded as Pa give such numbers
 MAX_BELOW = 0.1  # of the span, by which all values may lie below it
 MAX_REST = 0.8  # of the span, at which a pad may rest
+LEFT_OUT = "the calibration of a log leaves them out"
 # An array of many channels is searched for faults in so many pieces of so many samples, spread over the recording,
 # because the search holds what it reads in memory.
 PIECES, PIECE_LENGTH = 64, 512
@@ -116,7 +117,7 @@ def _array_findings(stats: StreamStatistics, force: Stream | None) -> Iterator[F
     time, values = _pieces(stats.stream)
     reference = None if force is None else resample(force.time, force.read()[:, :1], time)[:, 0]
     found = faults(values, reference)
-    repair = "check their sensors and wires; the calibration of a log leaves them out"
+    repair = f"check their sensors and wires; {LEFT_OUT}"
     kinds = {
         "hold no finite sample (dead)": (found.dead, repair),
         "have one value in 99 % of the samples (stuck)": (found.stuck, repair),

@@ -113,9 +113,7 @@ def _run_log(args: argparse.Namespace, calibration: "LogCalibration") -> int:
         option = "--loads" if args.loads is not None else "--tracker" if args.tracker is not None else "--track"
         raise ValueError(f"{option}: the calibration of a log has no EIT, which tells where contacts are")
     with open_session(args.session) as session:
-        found = apply_log(calibration, session, args.output, ignore_errors=args.force)
+        found = apply_log(calibration, session, args.output, ignore_errors=args.force, tell=show)
     outside = (~found.valid).mean() if len(found.valid) else 0.0
     show(f"{args.output}: {len(found.force)} forces in newtons, {outside:.1%} outside the calibrated range")
-    if unseen := calibration.unseen(found.force):
-        show(f"note: {unseen}")
     return 0
