@@ -31,12 +31,14 @@ from ..fitting.fields import Places
 from ..fitting.fields.places import nowhere
 from ..presses.streams import finite_mean
 from .follower import LiveFollower, followed_touches, padded
+from .plausibility import SILENT_PADS, SOUND, PadWatch, RestCheck
 from .recalibrator import LiveRecalibrator
 from .results import NO_TOUCHES, FrameResult, KindEstimate, TouchEstimates
 
 TOUCH_SIGNIFICANCE = 3.0  # a force above this many standard errors is a touch
 MAX_SEARCH_DELAY = 0.1  # s; then contacts are fitted even if a frame is dropped for it
 MAX_NEGATIVE_TIME = 1.0  # s below zero on a skin that nothing presses, after which the rest levels must be wrong
+REST_IMAGES = 8  # frames at rest, between which images of changes are made
 MAX_PLACE_AGE = 0.3  # s; older contacts do not describe the present frame
 IMAGE_DTYPE = "float32"  # of the image product; its matrices are built in float64, but read in half the memory
 
@@ -249,9 +251,11 @@ class Engine:
         recalibrator: LiveRecalibrator | None = None,
         follower: LiveFollower | None = None,
         proposal: je.contacts.Proposal | None = None,
+        check: RestCheck | None = None,
     ):
-        """`proposal`: tells what touches the skin; None: this is not told."""
-        self._rest, self._proposal = rest, proposal
+        """`proposal`: tells what touches the skin; None: this is not told. `check`: of rest levels; None: none."""
+        self._rest, self._proposal, self._check = rest, proposal, check
+        self._rest_fault, self._watch = SOUND, PadWatch.of(calibration)
         self._rest_levels = RestAverage(rest)
         self._number = 0
         self._negative_since: int | None = None
@@ -296,6 +300,15 @@ class Engine:
         """What is to be said of the places of the electrodes: of the first rest, or by the calibration."""
         return self._doubt if self._follower is None else self._follower.doubt
 
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What cannot be true in the streams: of the newest rest levels, and of contacts since."""
+        return tuple(filter(None, (self._rest_fault.words, SILENT_PADS if self._pads_are_silent else "")))
+
+    @property
+    def _pads_are_silent(self) -> bool:
+        return self._watch is not None and self._watch.silent
+
     def tare(self) -> None:
         """Measure the rest levels again."""
         self._rest_levels, self._negative_since, self.restless = RestAverage(self._rest), None, False
@@ -317,6 +330,19 @@ class Engine:
             self.restless = bool((found.loaded | found.negative).any())
             if self.restless:
                 self._rest_levels.slide()
+            else:
+                self._look_at_rest()
+
+    def _look_at_rest(self) -> None:
+        """Ask once whether the new rest levels can be true, and see the noise of images: silent pads tell no rest."""
+        assert self._rest_levels.levels is not None
+        voltages, pressures = self._rest_levels.levels
+        if self._check is not None:
+            self._rest_fault = self._check(voltages)
+        if self._watch is not None:
+            steps, still = np.diff(self._rest_levels.frames[-REST_IMAGES:], axis=0), np.zeros_like(pressures)
+            images = [self._programs.map(row, still, self._programs.nowhere, self._before).image for row in steps]
+            self._watch.begin(max((float(np.abs(image).max()) for image in images), default=0.0))
 
     def _note_negative(self, negative: np.ndarray, loaded: np.ndarray, now: int) -> None:
         """Note since when pads read below zero while none is pressed."""
@@ -348,6 +374,8 @@ class Engine:
         self._schedule_search(frame, bool(found.loaded.any()))
         self._recalibrate(frame, pressure, bool(found.loaded.any()), arrival.host)
         self._note_negative(found.negative & ~silent, found.loaded & ~silent, arrival.host)
+        if self._watch is not None:
+            self._watch.add(found.image, bool((found.loaded | found.negative | silent).any()), arrival.host)
         force = np.where(silent, np.nan, found.force)
         error = np.where(silent, np.nan, found.standard_error)
         self._follow(frame, force, error, arrival.host)
@@ -359,7 +387,7 @@ class Engine:
             force=force,
             standard_error=error,
             half_width=self._multiple * error,
-            valid=found.valid & ~silent & ~found.negative,
+            valid=found.valid & ~silent & ~found.negative & (not (self._rest_fault.refused or self._pads_are_silent)),
             centre=self._centre(found.map, force > TOUCH_SIGNIFICANCE * error),
             map=found.map,
             image=found.image,
@@ -368,6 +396,7 @@ class Engine:
             touches=self._touches,
             unsearched=self.unsearched,
             kinds=self._kinds(frame, force, bool(found.loaded.any())),
+            faults=self.faults,
         )
 
     def _is_ready(self, arrival: ReceivedFrame) -> bool:

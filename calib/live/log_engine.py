@@ -47,6 +47,7 @@ class LogEngine:
         return f"{'waiting for the sensor to be at rest' if self.restless else 'measuring the zero'}: do not touch it"
 
     doubt = ""  # of places: a log has none
+    faults: tuple[str, ...] = ()  # of EIT, and of pads against EIT
 
     @property
     def health(self) -> str:

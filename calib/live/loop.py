@@ -32,6 +32,7 @@ from ..record.wire.messages import Frame
 from .engine import Engine, ReceivedFrame
 from .follower import LiveFollower
 from .log_engine import LogEngine
+from .plausibility import rest_check
 from .recalibrator import LiveRecalibrator
 from .results import FrameResult, Result
 from .scan_control import ScanDirector, prepare_director
@@ -127,6 +128,7 @@ class LiveControl:
     | lost      | number of frames that were sent and did not arrive                                       |
     | health    | of the calibration, in words, while it is being recalibrated or its places are doubtful  |
     | doubt     | about places of contacts, in words                                                       |
+    | faults    | what cannot be true in the streams, in words                                             |
     | simulated | whether a device reports that its values are simulated                                   |
     | warn      | called with what the operator should know                                                |
     """
@@ -137,6 +139,7 @@ class LiveControl:
     lost: int = 0
     health: str = ""
     doubt: str = ""
+    faults: tuple[str, ...] = ()
     simulated: bool = False
     warn: Callable[[str], object] = _ignore
 
@@ -236,7 +239,14 @@ def _engine(
         layer = None if follower is None else follower.learned
         recalibrator = LiveRecalibrator(calibration, settings.moved, tell=control.warn, layer=layer)
     proposal = chosen_proposal(settings.proposal, calibration.skin, control.warn)
-    engine = Engine(calibration, settings.rest, recalibrator=recalibrator, follower=follower, proposal=proposal)
+    engine = Engine(
+        calibration,
+        settings.rest,
+        recalibrator=recalibrator,
+        follower=follower,
+        proposal=proposal,
+        check=rest_check(calibration),
+    )
     return engine, recalibrator
 
 
@@ -339,4 +349,8 @@ def _tell_state(control: LiveControl, engine: Engine | LogEngine, recorder: Reco
         control.warn(engine.state)
     if engine.doubt not in ("", control.doubt):
         control.warn(engine.doubt)
+    for fault in engine.faults:
+        if fault not in control.faults:
+            control.warn(fault)
+    control.faults = engine.faults
     control.state, control.health, control.doubt = engine.state, engine.health, engine.doubt

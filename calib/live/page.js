@@ -172,7 +172,8 @@ function halfWidth(result, pad) {  // of the interval of 90 %
 function tablePads(result) {
   $("pads").replaceChildren(...scene.pads.map((name, pad) => {
     const force = result.force[pad], known = force !== null, centre = scene.rows ? result.centre[pad] : [null];
-    const note = result.valid[pad] ? "" : known ? "out of range" : scene.rows ? "no pressure" : "no reading";
+    const doubtful = result.faults && result.faults.length ? "doubtful" : "out of range";
+    const note = result.valid[pad] ? "" : known ? doubtful : scene.rows ? "no pressure" : "no reading";
     const place = centre[0] === null ? "" : centre.map(x => mm(x).toFixed(0)).join(", ");
     const cells = [known ? fixed(force, 2) : "–", known ? `± ${halfWidth(result, pad).toFixed(2)}` : "–"];
     return rowOf(name, note, scene.rows ? [...cells, place] : cells, !result.valid[pad]);

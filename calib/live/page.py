@@ -187,7 +187,12 @@ class _Handler(BaseHTTPRequestHandler):
             result = self.server.newest(number)
             control = self.server.control
             about = json.dumps(
-                {"state": control.state, "health": control.health, "simulated": control.simulated, "lost": control.lost}
+                {
+                    "state": "; ".join((control.state, *control.faults)),
+                    "health": control.health,
+                    "simulated": control.simulated,
+                    "lost": control.lost,
+                }
             )
             text = result.to_json(image=True) if result is not None else "null"
             number = number if result is None else result.number

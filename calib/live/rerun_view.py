@@ -108,7 +108,8 @@ class RerunView:
 
     def _about(self) -> None:
         simulated = ", SIMULATED" if self._simulated or self._control.simulated else ""
-        self._stream.log("about", rr.TextDocument(f"{self._skin}{simulated}: {self._control.state}"))
+        state = "; ".join((self._control.state, *self._control.faults))
+        self._stream.log("about", rr.TextDocument(f"{self._skin}{simulated}: {state}"))
 
     def _picture(self, result: FrameResult, grid: "Grid") -> None:
         for name, values in (("map", result.map), ("image", np.abs(result.image))):

@@ -90,7 +90,8 @@ class FrameResult:
     | force          | on each pad; NaN without pressure                                      | (pads,)   | N    |
     | standard_error | of the force                                                           | (pads,)   | N    |
     | half_width     | half the interval that 90 % of readings of the force fall into         | (pads,)   | N    |
-    | valid          | whether the pressure is within the calibrated range                    | (pads,)   |      |
+    | valid          | whether the pressure is within the calibrated range, and the streams   | (pads,)   |      |
+    |                | can be those of this calibration                                       |           |      |
     | centre         | mean position of the force on each pressed pad; NaN on the others      | (pads, 2) | m    |
     | map            | force on each pixel; its sum is that of the pad forces                 | (pixels,) | N    |
     | image          | change of sheet conductivity from which the map is made                | (pixels,) | S    |
@@ -99,6 +100,7 @@ class FrameResult:
     | touches        | contacts, if the calibration fits contacts or they are followed        |           |      |
     | unsearched     | number of frames so far for which there was no time to fit contacts    | ()        |      |
     | kinds          | what touches the skin; None: nothing does, or no network tells it      |           |      |
+    | faults         | what cannot be true in the streams, in words                           |           |      |
     """
 
     number: int
@@ -116,6 +118,7 @@ class FrameResult:
     touches: TouchEstimates = NO_TOUCHES
     unsearched: int = 0
     kinds: KindEstimate | None = None
+    faults: tuple[str, ...] = ()
 
     def to_json(self, *, image: bool = False, shape: tuple[int, ...] = ()) -> str:
         """The result as one line of JSON; ``image`` adds map and image as base64 of little-endian f4.
@@ -137,6 +140,7 @@ class FrameResult:
             "contacts_age": self.touches.age,
             "unsearched": self.unsearched,
             "kinds": None if self.kinds is None else self.kinds.to_dict(),
+            "faults": list(self.faults),
         }
         if image:
             out |= {name: base64.b64encode(getattr(self, name).astype("<f4")).decode() for name in ("map", "image")}

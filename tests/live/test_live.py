@@ -89,6 +89,7 @@ class SearchingPrograms(FakePrograms):
 def calibration(monkeypatch, skin):
     """What live needs of one, of two pads and four pixels, without a computation."""
     monkeypatch.setattr(unwrap(Engine.__init__), "__defaults__", (2.0, FakePrograms))
+    monkeypatch.setattr(live_module, "rest_check", lambda calibration: None)
     recon = stand_in(
         je.Reconstructor,
         centres=CENTRES,
@@ -1146,7 +1147,8 @@ def test_from_a_simulated_skin_to_a_recording_a_calibration_and_live_forces(skin
         )
         force = session.stream("force")
         assert calibration.evaluation.summary()["force_rmse"] < 4.0
-    show, results = LiveControl(), []
+    show, results, told = LiveControl(), [], []
+    show.warn = told.append
     with SimulatedDevice(
         [recording_packets(tmp_path / "skin.h5", [name]) for name in ("eit", "pressure")], wait_for=1
     ) as device:
@@ -1154,6 +1156,7 @@ def test_from_a_simulated_skin_to_a_recording_a_calibration_and_live_forces(skin
         found = plan_recording({"eit": device.urls[0], "pressure": device.urls[1]}, skin)
         run_live(calibration, *found, [results.append], show, LiveSettings(rest=1.5))
     assert len(results) > 200
+    assert not [line for line in told if line.startswith("EIT")]
     _, each = np.unique([result.host for result in results], return_index=True)  # of frames read together one
     results = [results[n] for n in each]
     total = np.array([result.force.sum() for result in results])
