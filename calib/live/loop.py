@@ -23,7 +23,7 @@ from ..calibration.calibration import Calibration
 from ..calibration.localisation.contact_tracks import NotFollowed, prepare_calibrated_tracker
 from ..calibration.localisation.proposals import ProposalChoice, chosen_proposal
 from ..calibration.logs.calibration import LogCalibration
-from ..record.intake import NullSink, RecordSink, explain_silence
+from ..record.intake import NullSink, RecordSink, explain_reopening, explain_silence
 from ..record.plan import RecordingPlan, StreamPlan
 from ..record.priority import real_time
 from ..record.recorder import Recorder
@@ -128,7 +128,7 @@ class LiveControl:
     | lost      | number of frames that were sent and did not arrive                                       |
     | health    | of the calibration, in words, while it is being recalibrated or its places are doubtful  |
     | doubt     | about places of contacts, in words                                                       |
-    | faults    | what cannot be true in the streams, in words                                             |
+    | faults    | what cannot be true in the streams or hinders their links, in words                      |
     | simulated | whether a device reports that its values are simulated                                   |
     | warn      | called with what the operator should know                                                |
     """
@@ -155,6 +155,7 @@ class LiveSettings:
     |--------------|------------------------------------------------------------------------------|---------|------|
     | rest         | duration without contact at the beginning, in which rest levels are measured | 2       | s    |
     | wait         | time within which the devices must begin                                     | 10      | s    |
+    | seconds      | duration, counted from the first frame; None: until a stop is requested      | None    | s    |
     | event_driven | whether to request readings frame by frame, which the device must support    | False   |      |
     | realtime     | whether to use real-time scheduling once everything is compiled              | False   |      |
     | recalibrate  | whether zero and gains of the pads follow their drift                        | False   |      |
@@ -165,6 +166,7 @@ class LiveSettings:
 
     rest: float = limited(2.0, above=0)
     wait: float = limited(10.0, least=0)
+    seconds: float | None = None
     event_driven: bool = False
     realtime: bool = False
     recalibrate: bool = False
@@ -187,7 +189,7 @@ def run_live(
     log: RecordSink | None = None,
     begun: Callable[[], object] = lambda: None,
 ) -> int:
-    """Process frames until a stop is requested; returns the number of processed frames.
+    """Process frames until a stop is requested or the time is over; returns the number of processed frames.
 
     Args:
         plan, sources: of the streams eit and pressure, in this order, from `plan_recording`; of a log's calibration,
@@ -199,8 +201,8 @@ def run_live(
         begun: called when everything is compiled and the devices are connected.
 
     Raises:
-        LiveError: if the streams do not fit the calibration, do not begin, or fail; if contacts are to be followed
-            and the frames at rest do not tell the noise.
+        LiveError: if the streams do not fit the calibration, do not begin, or fail, or end before there is a result;
+            if contacts are to be followed and the frames at rest do not tell the noise.
         InverseError: if the network was trained for another skin.
         PriorityError: if real-time scheduling is refused.
     """
@@ -216,12 +218,18 @@ def run_live(
     control.state = f"waiting for the first frame of {' and '.join(source.plan.name for source in sources)}"
     with real_time(settings.realtime), recorder:
         begun()
-        count = _process_frames(engine, queue, recorder, viewers, control, settings.wait, director)
+        count = _process_frames(engine, queue, recorder, viewers, control, settings, director)
     if recalibrator is not None:
         control.warn(recalibrator.health)
         recalibrator.save()
     if recorder.failure is not None:
         raise LiveError(f"live: {recorder.failure}") from recorder.failure
+    if not count and not control.stop.is_set():
+        last = "; ".join((control.state, *control.faults))
+        raise LiveError(
+            f"live: ended without a result; its last state: {last}; give it more time (--seconds), or look at what the "
+            "devices send (jaxeit record)"
+        )
     return count
 
 
@@ -233,6 +241,7 @@ def _engine(
         _check_log(calibration, sources, settings)
         return LogEngine(calibration, settings.rest), None
     _check(calibration, sources)
+    _check_rest(settings)
     follower = _follower(calibration, settings.track, control.warn) if settings.track else None
     recalibrator = None
     if settings.recalibrate:
@@ -257,6 +266,14 @@ def _check(calibration: Calibration, sources: Sequence[Source]) -> None:
         what = f"{eit.channels} readings and {pressure.channels} pressures"
         raise LiveError(
             f"live: {what}, but this calibration is for {readings} and {pads}; give the calibration of this skin"
+        )
+
+
+def _check_rest(settings: LiveSettings) -> None:
+    if settings.seconds is not None and settings.rest >= settings.seconds:
+        raise LiveError(
+            f"live: the rest levels take {settings.rest:g} s (--rest), and live ends after {settings.seconds:g} s "
+            "(--seconds): nothing would be shown; give a longer --seconds or a shorter --rest"
         )
 
 
@@ -295,11 +312,12 @@ def _process_frames(
     recorder: Recorder,
     viewers: Sequence[Publish],
     control: LiveControl,
-    wait: float,
+    settings: LiveSettings,
     director: ScanDirector | None,
 ) -> int:
-    count, begun, until = 0, False, time.monotonic() + wait
+    count, begun, until = 0, False, time.monotonic() + settings.wait
     while not (control.stop.is_set() or recorder.stop.is_set() or recorder.ended):
+        _tell_faults(control, engine, recorder)
         if _must_tare(engine, control):
             engine.tare()
             if director is not None:
@@ -308,8 +326,11 @@ def _process_frames(
         if arrival is None:
             if not begun and time.monotonic() > until:
                 raise LiveError("; ".join(map(explain_silence, recorder.silent_receivers)))
+            if begun and time.monotonic() > until:
+                break
             continue
-        begun = True
+        if not begun:
+            begun, until = True, time.monotonic() + (np.inf if settings.seconds is None else settings.seconds)
         result = _step(engine, arrival, queue.dropped)
         _tell_state(control, engine, recorder)
         if result is not None:
@@ -319,6 +340,8 @@ def _process_frames(
             if director is not None:
                 director.update(cast(Engine, engine).pressed(arrival), cast(FrameResult, result).centre)
             engine.use_spare_time(queue.time_to_next())
+        if time.monotonic() > until:
+            break
     return count
 
 
@@ -349,8 +372,13 @@ def _tell_state(control: LiveControl, engine: Engine | LogEngine, recorder: Reco
         control.warn(engine.state)
     if engine.doubt not in ("", control.doubt):
         control.warn(engine.doubt)
-    for fault in engine.faults:
+    control.state, control.health, control.doubt = engine.state, engine.health, engine.doubt
+
+
+def _tell_faults(control: LiveControl, engine: Engine | LogEngine, recorder: Recorder) -> None:
+    """Show viewers what is wrong with the streams and their links, and warn the operator once of each."""
+    faults = (*engine.faults, *filter(None, map(explain_reopening, recorder.receivers)))
+    for fault in faults:
         if fault not in control.faults:
             control.warn(fault)
-    control.faults = engine.faults
-    control.state, control.health, control.doubt = engine.state, engine.health, engine.doubt
+    control.faults = faults

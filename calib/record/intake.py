@@ -23,6 +23,7 @@ TIMEOUT_PERIODS = 3  # periods of silence after which a link is opened again
 MIN_TIMEOUT = 0.5  # s; TCP repeats lost packets only after 0.2 s
 FIRST_FRAME_TIMEOUT = 5.0  # s for the first frame of a connection, and while the rate is not known
 MIN_RATE_FRAMES = 20  # frames from which the rate is known
+MIN_SILENCES = 2  # times in a row that a silent link was opened again, from which this is said
 MAX_CLOCK_LEAD = 1.0  # s by which a device's clock may run ahead between two frames and still count time
 MAX_LOST = 0.01  # tolerated fraction of lost frames
 MAX_REJECTED = 0.01  # tolerated fraction of rejected frames: a device may send some frames again
@@ -63,6 +64,7 @@ class StreamCounters:
     miscounted: int = 0  # kept, though their sequence numbers do not count up
     timeout: float = FIRST_FRAME_TIMEOUT  # s of silence after which a frame is overdue
     connections: int = 0
+    silences: int = 0  # links that were opened again because of silence, since frames came steadily
     simulated: bool = False
     earlier: DecoderCounts = field(default_factory=DecoderCounts)  # of links before the present one
     present: DecoderCounts = field(default_factory=DecoderCounts)
@@ -153,7 +155,9 @@ class StreamReceiver:
                 if frames:
                     last_frame, count = now, count + len(frames)
                     self.counters.timeout = timeout = self._timeout(now - began, count)
+                    self.counters.silences *= count < MIN_RATE_FRAMES
             if link.reopens_when_silent and now - last_frame > timeout:
+                self.counters.silences += 1
                 raise TimeoutError(
                     f"silent for {now - last_frame:.1f} s" if not data else f"no frame for {now - last_frame:.1f} s"
                 )
@@ -242,3 +246,15 @@ def explain_silence(receiver: StreamReceiver) -> str:
         number = receiver.source.plan.number
         return f"{name}: {url} sends frames of other streams, none of stream {number}; give id="
     return f"{name}: {url} sends nothing; check whether the device is running"
+
+
+def explain_reopening(receiver: StreamReceiver) -> str:
+    """What to do about a link that is opened again and again because its device is silent; empty for any other."""
+    plan, counters = receiver.source.plan, receiver.counters
+    if counters.silences < MIN_SILENCES:
+        return ""
+    remedy = "check the device" if plan.rate else "if the device is so slow, give its rate in Hz: ?rate=0.1"
+    return (
+        f"{plan.name}: no frame comes for {counters.timeout:.2g} s again and again, and the link is opened anew each "
+        f"time; {remedy}"
+    )

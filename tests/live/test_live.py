@@ -785,6 +785,70 @@ def test_streams_that_do_not_fit_or_do_not_come_are_said(calibration):
         run_live(calibration, plan, sources, [], LiveControl())
 
 
+@pytest.mark.parametrize("urls", [("tcp://127.0.0.1:1", "tcp://127.0.0.1:1"), None])
+def test_live_of_some_seconds_says_why_it_shows_nothing(calibration, urls):
+    """Its time counts from the first frame, so that a device that does not begin is always named."""
+    settings = LiveSettings(wait=0.3, rest=0.1, seconds=0.2, proposal=None)
+    with small_device() as device:
+        plan, sources = plan_recording(
+            dict(zip(("eit", "pressure"), urls or device.urls[::-1], strict=True)), calibration.skin
+        )
+        with pytest.raises(LiveError, match="frames of other streams" if urls is None else "nothing answers"):
+            run_live(calibration, plan, sources, [], LiveControl(), settings)
+
+
+def test_live_counts_its_seconds_from_the_first_frame(calibration):
+    results = []
+    settings = LiveSettings(rest=0.2, seconds=0.6, proposal=None)
+    with small_device() as device:
+        count = run_live(calibration, *sources_of(device, calibration), [results.append], LiveControl(), settings)
+    assert 10 < count == len(results) < 60
+
+
+def test_live_that_ends_while_the_skin_is_not_at_rest_says_so(calibration):
+    times = [n * S // 100 for n in range(10**5)]
+    eit = frame_packets(1, iter(times), (np.zeros(READINGS, "f4") for _ in times))
+    pressure = frame_packets(2, iter(times), (np.array([1e-7 * t, 0.0], "f4") for t in times))  # pressed ever more
+    with (
+        SimulatedDevice([eit, pressure], wait_for=1) as device,
+        pytest.raises(LiveError, match="to be at rest") as said,
+    ):
+        run_live(
+            calibration,
+            *sources_of(device, calibration),
+            [],
+            LiveControl(),
+            LiveSettings(rest=0.2, seconds=0.8, proposal=None),
+        )
+    assert "--seconds" in str(said.value)
+
+
+def test_no_time_beside_the_rest_levels_is_refused(calibration):
+    plan, sources = plan_recording({"eit": "tcp://127.0.0.1:1", "pressure": "tcp://127.0.0.1:1"}, calibration.skin)
+    with pytest.raises(LiveError, match=r"rest levels take 100 s .*live ends after 5 s"):
+        run_live(calibration, plan, sources, [], LiveControl(), LiveSettings(rest=100.0, seconds=5.0))
+
+
+def test_a_link_that_is_opened_again_and_again_is_said(calibration, monkeypatch):
+    """As that of a device that is slower than the time after which silence counts, and states no rate."""
+    monkeypatch.setattr("calib.record.intake.FIRST_FRAME_TIMEOUT", 0.1)
+    monkeypatch.setattr("calib.record.intake.MIN_TIMEOUT", 0.1)
+    times = range(0, 10**5 * S, S // 2)
+    show, told = LiveControl(), []
+    show.warn = told.append
+    eit = frame_packets(1, iter(times), (np.zeros(READINGS, "f4") for _ in times))
+    pressure = frame_packets(2, iter(range(0, 1000 * S, S // 100)), (np.zeros(2, "f4") for _ in range(10**5)))
+    settings = LiveSettings(rest=2.5, seconds=3.0, proposal=None)
+    with SimulatedDevice([eit, pressure], wait_for=1) as device:
+        plan, sources = sources_of(device, calibration)
+        with pytest.raises(LiveError, match="without a result"):
+            run_live(calibration, plan, sources, [], show, settings)
+    (line,) = [line for line in told if "opened anew" in line]
+    assert line.startswith("eit: no frame comes for 0.1 s")
+    assert "?rate=" in line
+    assert line in show.faults
+
+
 def test_live_says_what_to_do_where_frames_at_rest_do_not_tell_the_noise(calibration):
     settings = LiveSettings(rest=0.01, track=True, proposal=None)
     with small_device() as device, pytest.raises(LiveError, match=r"tell.* untouched .*--rest"):

@@ -1,7 +1,7 @@
 """`jaxeit live`."""
 
 import argparse
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from ..arguments import (
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from ...calibration import Calibration, LogCalibration
     from ...live.loop import LiveControl, LiveSettings
     from ...record.plan import RecordingPlan
-    from ...record.recorder import StopRequest
     from ...record.sources import Source
 
 
@@ -56,7 +55,7 @@ def _add_stream_arguments(parser: argparse.ArgumentParser) -> None:
     )
     text = "time within which every device must begin to send; default: 10"
     parser.add_argument("--wait", type=above_zero, default=10.0, metavar="S", help=text)
-    parser.add_argument("--seconds", type=above_zero, help="duration; default: until Ctrl-C")
+    parser.add_argument("--seconds", type=above_zero, help="duration from the first frame on; default: until Ctrl-C")
 
 
 def _add_output_arguments(parser: argparse.ArgumentParser) -> None:
@@ -98,8 +97,6 @@ def run(args: argparse.Namespace) -> int:
     also: list[Publish] = [lambda result: print(result.to_json(), flush=True)] if args.json else []
     with orderly_end(orders, planned=False), ExitStack() as stack:
         also += [stack.enter_context(viewer).show_result for viewer in _viewers(args, calibration, show)]
-        if args.seconds is not None:
-            stack.enter_context(_timed(args.seconds, orders))
         count = present(
             calibration,
             plan,
@@ -110,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
             also=also,
             tell=say,
         )
-    say(f"{count} frames")
+    say(f"{count} frames" if count else f"0 frames: {show.state}")
     return orders.status
 
 
@@ -123,20 +120,6 @@ def _check_options(args: argparse.Namespace) -> None:
             raise ValueError(f"{option}: it is about topics; add --ros2 or --foxglove, or leave it out")
 
 
-@contextmanager
-def _timed(seconds: float, orders: "StopRequest") -> "Iterator[None]":
-    """Within this context a stop is requested after so many seconds."""
-    from threading import Timer
-
-    timer = Timer(seconds, orders.stop_recording)
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
-
-
 def _settings(args: argparse.Namespace) -> "LiveSettings":
     from ...live.loop import LiveSettings
 
@@ -145,6 +128,7 @@ def _settings(args: argparse.Namespace) -> "LiveSettings":
         realtime=args.realtime,
         rest=args.rest,
         wait=args.wait,
+        seconds=args.seconds,
         track=tracking_of(args),
         proposal=proposal_of(args.proposal),
         recalibrate=args.recalibrate is not None,
