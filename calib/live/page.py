@@ -20,6 +20,7 @@ from .page_scene import page_scene
 from .results import Result
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
+HTTP_PORT = 80
 PAGE_FILE = Path(__file__).with_name("page.html")
 PAGE_PARTS = ("page.css", "page.js", "history.js")
 MIN_RESULT_INTERVAL = 0.04  # s between two results for a viewer; the eye sees no more
@@ -77,8 +78,12 @@ class Page(ThreadingHTTPServer):
 
         A server on this machine only refuses other names, so that no foreign web page can reach it by DNS rebinding.
         """
+        if self._host not in LOOPBACK:
+            return None
         port = self.server_address[1]
-        return {host_and_port(name, port) for name in LOOPBACK} if self._host in LOOPBACK else None
+        names = {host_and_port(name, port) for name in LOOPBACK}
+        # Browsers leave out the usual port of HTTP.
+        return names | {name.removesuffix(f":{HTTP_PORT}") for name in names} if port == HTTP_PORT else names
 
     def show_result(self, result: Result) -> None:
         """Hand over the newest result; returns at once, and viewers take the result when they are ready."""

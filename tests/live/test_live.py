@@ -942,6 +942,17 @@ def test_only_our_own_page_may_ask(page):
     assert page.control.tare.is_set()
 
 
+def test_a_page_on_the_port_of_http_is_reached_by_its_bare_name(page, monkeypatch):
+    """Browsers leave out port 80 in Host and Origin."""
+    own = {"Host": "localhost", "Origin": "http://localhost"}
+    assert fetch(page, "/", headers=own)[1].status == 403  # on any other port it is another site
+    monkeypatch.setattr("calib.live.page.HTTP_PORT", page.server_address[1])
+    assert fetch(page, "/", headers=own)[1].status == 200
+    assert fetch(page, "/tare", method="POST", headers=own)[1].status == 200
+    assert fetch(page, "/", headers={"Host": "[::1]"})[1].status == 200
+    assert fetch(page, "/", headers={"Host": "evil.example"})[1].status == 403
+
+
 def test_a_flood_of_connections_leaves_the_viewers_there_are(page, monkeypatch):
     monkeypatch.setattr(page.RequestHandlerClass, "timeout", 60.0)
     link, reply, _ = fetch(page, "/results")
