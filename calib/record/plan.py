@@ -92,10 +92,13 @@ class StreamPlan:
             raise PlanError(f"stream {self.name!r} is not known; use one of {', '.join(STREAM_KINDS)}")
         if self.number < 0:
             object.__setattr__(self, "number", self.kind.number)
-        numbers = (self.rate, self.scale, self.offset, self.tick)
-        if not np.isfinite(numbers).all() or self.rate < 0 or not 1e-12 <= self.tick < 1e3:
-            what = f"rate {self.rate} Hz, tick {self.tick} s"
-            raise PlanError(f"{self.name}: {what}; give numbers above zero, and a tick of 1e-12 to 1e3 s")
+        for field in ("rate", "scale", "offset", "tick"):
+            if not math.isfinite(number := getattr(self, field)):
+                raise PlanError(f"{self.name}: {field} {number}; give a finite number")
+        if self.rate < 0:
+            raise PlanError(f"{self.name}: rate {self.rate} Hz; give the rate in Hz, or 0 if it is not known")
+        if not 1e-12 <= self.tick < 1e3:
+            raise PlanError(f"{self.name}: tick {self.tick} s; give 1e-12 to 1e3 s")
         self.layout  # noqa: B018  checks channels, scale and number
         _check_texts(self)
 

@@ -14,6 +14,7 @@ connection is lost; the reader opens it again.
 """
 
 import abc
+import math
 import re
 import select
 import socket
@@ -322,6 +323,10 @@ def _options(name: str, url: str, query: str) -> dict[str, str | float]:
             found[key] = float(text) if key in FLOAT_OPTIONS else int(text) if key in INTEGER_OPTIONS else text
         except ValueError:
             raise SourceError(f"{name}: {key}={text} in {url!r} is not a number; give one") from None
+        if key in FLOAT_OPTIONS and not math.isfinite(float(found[key])):
+            raise SourceError(f"{name}: {key}={text} in {url!r} is not a finite number; give one")
+        if key == "rate" and not float(found[key]) > 0:
+            raise SourceError(f"{name}: rate={text} in {url!r}; give the rate in Hz, above zero, or leave it out")
     return found
 
 
@@ -329,11 +334,13 @@ def _check_address(name: str, url: str, parts: SplitResult) -> None:
     try:
         port = parts.port
     except ValueError:
-        port = None
+        port = 0
     known = ("tcp", "serial", "replay", *PYSERIAL_SCHEMES)
     if parts.scheme not in known:
         raise SourceError(f"{name}: {url!r} names no source; use {', '.join(s + '://' for s in known)}")
     if parts.scheme in ("tcp", "socket") and (not parts.hostname or port is None):
         raise SourceError(f"{name}: {url!r} lacks host or port; use {parts.scheme}://HOST:PORT")
+    if port == 0:
+        raise SourceError(f"{name}: the port of {url!r} is none; give a number from 1 to 65535")
     if parts.scheme in ("serial", "replay") and not parts.netloc + parts.path:
         raise SourceError(f"{name}: {url!r} names no {'port' if parts.scheme == 'serial' else 'file'}")
