@@ -13,7 +13,7 @@ Gaussian,
     g(p, s) g(q, t) = exp(-|p - q|^2 / 2(s^2 + t^2)) g((p t^2 + q s^2) / (s^2 + t^2), s t / sqrt(s^2 + t^2)),
 
 so that K contacts are K + K (K + 1) / 2 bumps.  The table holds cubic B-splines over place and log width, with exact
-derivatives, in the few directions of the whitened readings (`imaging.whitening`) that bumps reach.
+derivatives, in the signal subspace: the few directions of whitened readings (`imaging.whitening`) that bumps reach.
 """
 
 import itertools
@@ -29,8 +29,10 @@ from ..model.discretisation import Model
 
 # c and d above: part of the second order, and its saturation.
 SECOND_ORDER, SATURATION = 0.8, 0.7
-# Distance, in widths, beyond which a bump is nothing: exp(-18) of its height. Rows of nodes that are computed together.
-REACH, ROWS = 6.0, 8
+# Distance, in widths, beyond which a bump counts as zero: exp(-18) of its height.
+CUTOFF_WIDTHS = 6.0
+# Number of rows of nodes that are computed together.
+TILE_ROWS = 8
 # Pitch of the table in log width.
 WIDTH_PITCH = 0.25
 
@@ -57,24 +59,24 @@ class Responses(eqx.Module):
         t = (place[jnp.array([1, 0, 2])] - self.origin) / self.pitch
         cells = jnp.array(self.table.shape[:3], t.dtype) - 4
         cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(t)), 0, cells)
-        value, slope = _cubic(t - cell)
+        value, slope = _cubic_splines(t - cell)
         corner = *cell.astype(int), 0
         block = jax.lax.dynamic_slice(self.table, corner, (4, 4, 4, self.table.shape[3])).reshape(64, -1)
         (a, b, c), (da, db, dc) = value, slope / self.pitch[:, None]
         weights = jnp.stack([_outer(*abc) for abc in ((a, b, c), (a, db, c), (da, b, c), (a, b, dc))])
-        found = weights @ block
-        return found[0], found[1:]
+        responses = weights @ block
+        return responses[0], responses[1:]
 
     def contacts(self, theta: Float[Array, "n 4"]) -> tuple[Float[Array, " r"], Float[Array, "r n 4"]]:
         """Response of n contacts (x, y, log width, strength in units of sigma_0 scale^2), and its slopes."""
-        place, weight = self._bumps(theta)
-        places, weights = jax.jacfwd(self._bumps)(theta)
+        place, weight = self._equivalent_bumps(theta)
+        places, weights = jax.jacfwd(self._equivalent_bumps)(theta)
         value, slope = jax.vmap(self.bump)(place)
         by_place = jnp.einsum("m,mcr,mcnp->rnp", weight, slope, places)
         return weight @ value, by_place + jnp.einsum("mr,mnp->rnp", value, weights)
 
-    def _bumps(self, theta: Float[Array, "n 4"]) -> tuple[Float[Array, "m 3"], Float[Array, " m"]]:
-        """The bumps that n contacts amount to: x, y, log width, and their strengths."""
+    def _equivalent_bumps(self, theta: Float[Array, "n 4"]) -> tuple[Float[Array, "m 3"], Float[Array, " m"]]:
+        """The bumps whose linear responses add to that of n contacts: x, y, log width, and their strengths."""
         centre, width, strength = theta[:, :2], theta[:, 2], theta[:, 3]
         square = jnp.exp(2 * width)
         u = strength * self.scale**2 / square
@@ -93,8 +95,8 @@ def _outer(a: Float[Array, " i"], b: Float[Array, " j"], c: Float[Array, " k"]) 
     return (a[:, None, None] * b[:, None] * c).ravel()
 
 
-def _cubic(t: Float[Array, "..."]) -> tuple[Float[Array, "... 4"], Float[Array, "... 4"]]:
-    """The four cubic B-splines that are not zero at t in [0, 1], (..., 4), and their slopes."""
+def _cubic_splines(t: Float[Array, "..."]) -> tuple[Float[Array, "... 4"], Float[Array, "... 4"]]:
+    """The four cubic B-splines that are nonzero at t in [0, 1], (..., 4), and their slopes."""
     t = t[..., None]
     u = 1 - t
     value = [u**3, 3 * t**3 - 6 * t**2 + 4, 3 * u**3 - 6 * u**2 + 4, t**3]
@@ -108,8 +110,8 @@ class Nodes(NamedTuple):
     axes: tuple[np.ndarray, np.ndarray, np.ndarray]
     scale: float
 
-    def fewer(self, stride: int) -> "Nodes":
-        """Every so many along each axis."""
+    def subsample(self, stride: int) -> "Nodes":
+        """Every ``stride``-th node along each axis."""
         y, x, log_width = self.axes
         return self._replace(axes=(y[::stride], x[::stride], log_width[::stride]))
 
@@ -119,7 +121,7 @@ def mean_conductivity(model: Model, sigma: np.ndarray) -> float:
     return float(np.average(sigma, weights=np.asarray(model.areas, float)))
 
 
-def nodes_of(model: Model, widths: tuple[float, float], columns: int) -> Nodes:
+def table_nodes(model: Model, widths: tuple[float, float], columns: int) -> Nodes:
     """Nodes for bumps of widths (smallest, largest), with so many columns along x."""
     chart = np.asarray(model.chart, float)
     low, high = chart.min(0), chart.max(0)
@@ -138,22 +140,22 @@ def tabulate(model: Model, jacobian: np.ndarray, nodes: Nodes) -> np.ndarray:
     """
     y, x, log_widths = nodes.axes
     out = np.empty((len(y), len(x), len(log_widths), len(jacobian)))
-    middle, size = _middles(model)
-    order = np.argsort(middle[:, 1])
-    middle, jacobian = middle[order], jacobian[:, order]
+    centres, size = _element_centres(model)
+    order = np.argsort(centres[:, 1])
+    centres, jacobian = centres[order], jacobian[:, order]
     for level, width in enumerate(np.exp(log_widths)):
-        points, weights = points_of(model, width)
-        points, far = points[order], REACH * width + size
-        for columns in _tiles(x, int((x[-1] - x[0]) / (2 * far))):
-            beside = _reached(middle[:, 0], x[columns], far)
-            across = _bumps(points[beside, :, 0], x[columns], width) * weights[:, None]
-            for rows in _tiles(y, len(y) // ROWS):
-                first, last = np.searchsorted(middle[beside, 1], [y[rows][0] - far, y[rows][-1] + far])
-                near = beside[first:last]
-                along = np.swapaxes(_bumps(points[near, :, 1], y[rows], width), 1, 2)
+        points, weights = quadrature_points(model, width)
+        points, reach = points[order], CUTOFF_WIDTHS * width + size
+        for columns in _tiles(x, int((x[-1] - x[0]) / (2 * reach))):
+            near_columns = _within_reach(centres[:, 0], x[columns], reach)
+            across = _bumps(points[near_columns, :, 0], x[columns], width) * weights[:, None]
+            for rows in _tiles(y, len(y) // TILE_ROWS):
+                first, last = np.searchsorted(centres[near_columns, 1], [y[rows][0] - reach, y[rows][-1] + reach])
+                near_tile = near_columns[first:last]
+                along = np.swapaxes(_bumps(points[near_tile, :, 1], y[rows], width), 1, 2)
                 means = along @ across[first:last]  # (elements, rows, columns)
-                found = jacobian[:, near] @ means.reshape(len(means), -1)
-                part = np.moveaxis(found.reshape(-1, *means.shape[1:]), 0, -1)
+                responses = jacobian[:, near_tile] @ means.reshape(len(means), -1)
+                part = np.moveaxis(responses.reshape(-1, *means.shape[1:]), 0, -1)
                 out[rows, columns, level] = (nodes.scale / width) ** 2 * part
     return out
 
@@ -164,9 +166,9 @@ def _tiles(axis: np.ndarray, count: int) -> list[slice]:
     return [slice(a, b) for a, b in itertools.pairwise(ends.tolist())]
 
 
-def _reached(middle: np.ndarray, some: np.ndarray, far: float) -> np.ndarray:
-    """Which middles lie no further than this from a part of an axis."""
-    return np.flatnonzero((middle > some[0] - far) & (middle < some[-1] + far))
+def _within_reach(centres: np.ndarray, tile: np.ndarray, reach: float) -> np.ndarray:
+    """Indices of the elements whose centres lie within ``reach`` of a tile of an axis."""
+    return np.flatnonzero((centres > tile[0] - reach) & (centres < tile[-1] + reach))
 
 
 def _bumps(points: np.ndarray, centres: np.ndarray, width: float) -> np.ndarray:
@@ -174,8 +176,8 @@ def _bumps(points: np.ndarray, centres: np.ndarray, width: float) -> np.ndarray:
     return np.asarray(np.exp(-0.5 * ((points[..., None] - centres) / width) ** 2))
 
 
-def _middles(model: Model) -> tuple[np.ndarray, float]:
-    """Middles of the elements, (elements, 2), and the largest extent of one, m."""
+def _element_centres(model: Model) -> tuple[np.ndarray, float]:
+    """Centres of the elements, (elements, 2), and the largest extent of one, m."""
     corners = np.asarray(model.chart, float)[np.asarray(model.triangles)]
     return corners.mean(1), float(np.ptp(corners, axis=1).max())
 
@@ -186,47 +188,48 @@ _RULE = np.array([[1 - 2 * c if i == k else c for i in range(3)] for c in (_A, _
 _RULE_WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
 
 
-def points_of(model: Model, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points of each element, (elements, q, 2), as close as the width asks for, and their weights, (q,)."""
-    rule, weights = rule_of(model, width)
+def quadrature_points(model: Model, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Quadrature points of each element, (elements, q, 2), as dense as the width needs, and their weights, (q,)."""
+    rule, weights = quadrature_rule(model, width)
     corners = np.asarray(model.chart, float)[np.asarray(model.triangles)]
     return np.einsum("qk,ekd->eqd", rule, corners), weights
 
 
-def rule_of(model: Model, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Barycentric coordinates of the points of each element, (q, 3), and their weights, (q,)."""
+def quadrature_rule(model: Model, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Barycentric coordinates of the quadrature points of each element, (q, 3), and their weights, (q,)."""
     corners = np.asarray(model.chart, float)[np.asarray(model.triangles)]
     longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=2).max()
     parts = int(np.clip(np.ceil(longest / (3 * width)), 1, 3))
-    small = _parts(parts)
-    rule = np.einsum("qk,pkc->pqc", _RULE, small).reshape(-1, 3)
-    return rule, np.tile(_RULE_WEIGHTS, len(small)) / len(small)
+    triangles = _subdivide(parts)
+    rule = np.einsum("qk,pkc->pqc", _RULE, triangles).reshape(-1, 3)
+    return rule, np.tile(_RULE_WEIGHTS, len(triangles)) / len(triangles)
 
 
-def _parts(n: int) -> np.ndarray:
-    """The reference triangle cut into n^2 alike: barycentric coordinates of their corners, (n^2, 3, 3)."""
+def _subdivide(n: int) -> np.ndarray:
+    """The reference triangle cut into n^2 equal ones: barycentric coordinates of their corners, (n^2, 3, 3)."""
     cuts = [(i, j) for i in range(n) for j in range(n - i)]
     upright = [[(i, j), (i + 1, j), (i, j + 1)] for i, j in cuts]
-    turned = [[(i + 1, j), (i + 1, j + 1), (i, j + 1)] for i, j in cuts if i + j < n - 1]
-    corners = np.array(upright + turned) / n
+    inverted = [[(i + 1, j), (i + 1, j + 1), (i, j + 1)] for i, j in cuts if i + j < n - 1]
+    corners = np.array(upright + inverted) / n
     return np.concatenate([corners, 1 - corners.sum(2, keepdims=True)], 2)
 
 
-def reached(values: np.ndarray, least: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
-    """Directions of whitened readings in which bumps are seen above ``least`` of the noise, and the others."""
+def signal_subspace(values: np.ndarray, threshold: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of whitened readings in which the rms of bumps is above ``threshold``, and their complement."""
     flat = values.reshape(-1, values.shape[-1])
     squares, vectors = np.linalg.eigh(flat.T @ flat / len(flat))
-    seen = squares > max(least**2, 1e-14 * squares[-1])
-    return vectors[:, seen], vectors[:, ~seen]
+    signal = squares > max(threshold**2, 1e-14 * squares[-1])
+    return vectors[:, signal], vectors[:, ~signal]
 
 
-def responses_of(values: np.ndarray, nodes: Nodes, background: float, dtype: np.dtype) -> Responses:
-    """The splines through a table of `tabulate`."""
+def spline_responses(values: np.ndarray, nodes: Nodes, background: float, dtype: np.dtype) -> Responses:
+    """Responses by the splines through a table of `tabulate`."""
+    coefficients = jnp.asarray(spline_coefficients(values), dtype)
     numbers = ([axis[0] for axis in nodes.axes], [axis[1] - axis[0] for axis in nodes.axes], nodes.scale, background)
-    return Responses(jnp.asarray(splines(values), dtype), *(jnp.asarray(number, dtype) for number in numbers))
+    return Responses(coefficients, *(jnp.asarray(number, dtype) for number in numbers))
 
 
-def splines(values: np.ndarray) -> np.ndarray:
+def spline_coefficients(values: np.ndarray) -> np.ndarray:
     """Coefficients of the cubic splines through values on a grid, along the first three axes."""
     for axis, n in enumerate(values.shape[:3]):
         matrix = np.zeros((n + 2, n + 2))

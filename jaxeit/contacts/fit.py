@@ -18,10 +18,10 @@ from .bump_responses import Responses
 MAX_HALF_LENGTH = 0.04
 # Largest number of steps of a fit, and number of steps after which it is compared with others.
 MAX_STEPS, TRIAL_STEPS = 20, 4
-# Places of the four bumps along the half length of an oblong contact.
-PLACES_ALONG = np.array([-0.75, -0.25, 0.25, 0.75])
+# Positions of the four bumps of an oblong contact, in half lengths.
+LINE_PLACES = np.array([-0.75, -0.25, 0.25, 0.75])
 
-# From all parameters of a fit to the bumps that they stand for.
+# Map from all parameters of a fit to its bumps.
 Shape = Callable[[Array], Array]
 
 # A fit ends where chi-square will fall by less than a thousandth, or by less than 1e-4 of itself: half of chi-square is
@@ -42,7 +42,7 @@ class ContactFit(NamedTuple):
     | meaning                                                         | shape |
     |-----------------------------------------------------------------|-------|
     | flat: all parameters, four for each contact                     | (m,)  |
-    | square: sum of the squares of what the contacts do not explain  | ()    |
+    | square: residual sum of squares                                 | ()    |
     | converged                                                       | ()    |
     """
 
@@ -51,45 +51,45 @@ class ContactFit(NamedTuple):
     converged: Bool[Array, ""]
 
 
-class UnfinishedFit(NamedTuple):
-    """Parameters (m,) accepted last, and the state of the solver."""
+class FitState(NamedTuple):
+    """An iterate of a fit: the parameters (m,) accepted last, and the state of the solver."""
 
     flat: Float[Array, " m"]
     state: LeastSquaresState
 
     @property
     def square(self) -> Float[Array, "..."]:
-        """Sum of the squares of what the contacts do not explain."""
+        """Residual sum of squares."""
         return self.state.square
 
     @property
     def fit(self) -> ContactFit:
-        """The fit as it is."""
+        """The fit at this iterate."""
         return ContactFit(self.flat, self.state.square, self.state.converged)
 
 
-def one_row_each(flat: Float[Array, " parameters"]) -> Float[Array, "contacts 4"]:
+def contact_rows(flat: Float[Array, " parameters"]) -> Float[Array, "contacts 4"]:
     """Contacts (x, y, log width, strength) from all parameters."""
     return flat.reshape(-1, 4)
 
 
-def bumps_along(flat: Float[Array, "6"]) -> Float[Array, "4 4"]:
-    """One contact along a line of half length (flat[4], flat[5]): four bumps that share its strength."""
-    count = len(PLACES_ALONG)
-    centre = flat[:2] + jnp.asarray(PLACES_ALONG, flat.dtype)[:, None] * flat[4:]
+def bumps_on_line(flat: Float[Array, "6"]) -> Float[Array, "4 4"]:
+    """Four bumps that share the strength of one contact, on a line of half length (flat[4], flat[5])."""
+    count = len(LINE_PLACES)
+    centre = flat[:2] + jnp.asarray(LINE_PLACES, flat.dtype)[:, None] * flat[4:]
     rest = jnp.broadcast_to(flat[2:4] * jnp.array([1, 1 / count], flat.dtype), (count, 2))
     return jnp.concatenate([centre, rest], 1)
 
 
 class FrameResponse(eqx.Module):
-    """How the numbers that a frame holds depend on contacts, and within which bounds contacts are looked for.
+    """Forward model of the signal in a frame, and the bounds of its contacts.
 
     | meaning                                                                          | shape      |
     |----------------------------------------------------------------------------------|------------|
     | responses: table of responses                                                    |            |
     | low, high: bounds of x, y, log width, strength                                   | (4,), (4,) |
-    | root: mixes responses as missing readings ask for (`imaging.missing`)            | (r, r)     |
-    | whole: no reading is missing, and responses are taken as they are                | ()         |
+    | root: whitens responses if readings are missing (`imaging.missing`)              | (r, r)     |
+    | whole: no reading is missing, and responses need no whitening                    | ()         |
     """
 
     responses: Responses
@@ -99,54 +99,54 @@ class FrameResponse(eqx.Module):
     whole: Bool[Array, ""]
 
     def response(self, theta: Float[Array, "n 4"]) -> tuple[Float[Array, " r"], Float[Array, "r n 4"]]:
-        """What n contacts do to the numbers that the frame holds, and its slopes."""
+        """Signal of n contacts in the frame, and its slopes."""
         value, slopes = self.responses.contacts(theta)
 
-        def mixed(
+        def whiten(
             value: Float[Array, " r"], slopes: Float[Array, "r n 4"]
         ) -> tuple[Float[Array, " r"], Float[Array, "r n 4"]]:
             return self.root @ value, jnp.tensordot(self.root, slopes, 1)
 
-        seen: tuple[Array, Array] = jax.lax.cond(self.whole, lambda *a: a, mixed, value, slopes)
-        return seen
+        observed: tuple[Array, Array] = jax.lax.cond(self.whole, lambda *a: a, whiten, value, slopes)
+        return observed
 
-    def mixed(self, response: Float[Array, " r"]) -> Float[Array, " r"]:
-        """A response as the frame shows it."""
-        seen: Array = jax.lax.cond(self.whole, lambda r: r, lambda r: self.root @ r, response)
-        return seen
+    def whiten(self, response: Float[Array, " r"]) -> Float[Array, " r"]:
+        """Whiten a response as the readings of the frame, of which some may be missing."""
+        observed: Array = jax.lax.cond(self.whole, lambda r: r, lambda r: self.root @ r, response)
+        return observed
 
     def fit(self, y: Float[Array, " r"], theta: Float[Array, "n 4"]) -> ContactFit:
         """The best n contacts near these."""
         return self._solve(y, theta.ravel(), MAX_STEPS + 1).fit
 
-    def try_out(self, y: Float[Array, " r"], theta: Float[Array, "n 4"]) -> UnfinishedFit:
-        """A few steps towards the best n contacts near these."""
+    def trial_fit(self, y: Float[Array, " r"], theta: Float[Array, "n 4"]) -> FitState:
+        """The first `TRIAL_STEPS` steps of a fit of n contacts."""
         return self._solve(y, theta.ravel(), TRIAL_STEPS + 1)
 
-    def unstarted(self, y: Float[Array, " r"], theta: Float[Array, "n 4"]) -> UnfinishedFit:
-        """A fit without a step."""
-        problem = self._problem(y, one_row_each)
+    def init(self, y: Float[Array, " r"], theta: Float[Array, "n 4"]) -> FitState:
+        """The initial state of a fit, before the first step."""
+        problem = self._problem(y, contact_rows)
         start = theta.ravel()
         state = SOLVER.init(_residual, start, problem, {"quadratic": _quadratic}, None, None, frozenset())
-        return UnfinishedFit(start, state)
+        return FitState(start, state)
 
     def finish(
-        self, y: Float[Array, " r"], begun: UnfinishedFit, aim: Float[Array, ""], outlook: Int[Array, ""]
+        self, y: Float[Array, " r"], iterate: FitState, aim: Float[Array, ""], outlook: Int[Array, ""]
     ) -> ContactFit:
-        """A fit to its end; given up where chi-square does not come below ``aim`` within ``outlook`` more falls."""
-        options = {"state": begun.state, "aim": aim / 2, "outlook": outlook}
-        return self._solve(y, begun.flat, MAX_STEPS, options).fit
+        """Continue a fit; give it up where chi-square would not be below ``aim`` after ``outlook`` more falls."""
+        options = {"state": iterate.state, "aim": aim / 2, "outlook": outlook}
+        return self._solve(y, iterate.flat, MAX_STEPS, options).fit
 
     def fit_oblong(self, y: Float[Array, " r"], pair: Float[Array, "2 4"]) -> ContactFit:
-        """The best oblong contact in the place of two: x, y, log width, strength and half length along x and y."""
+        """Fit one oblong contact from the moments of two: x, y, log width, strength and half length along x and y."""
         share = pair[:, 3] / jnp.maximum(pair[:, 3].sum(), jnp.finfo(y.dtype).tiny)
-        half = jnp.sqrt(3 * share[0] * share[1]) * (pair[1, :2] - pair[0, :2])  # the same second moment
+        half = jnp.sqrt(3 * share[0] * share[1]) * (pair[1, :2] - pair[0, :2])  # equal second moment
         start = jnp.concatenate([share @ pair[:, :3], pair[:, 3].sum()[None], half])
-        low, high = self._bounds(bumps_along, 6)
-        return self._solve(y, jnp.clip(start, low, high).astype(y.dtype), MAX_STEPS + 1, shape=bumps_along).fit
+        low, high = self._bounds(bumps_on_line, 6)
+        return self._solve(y, jnp.clip(start, low, high).astype(y.dtype), MAX_STEPS + 1, shape=bumps_on_line).fit
 
     def _bounds(self, shape: Shape, size: int) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        if shape is one_row_each:
+        if shape is contact_rows:
             return jnp.tile(self.low, size // 4), jnp.tile(self.high, size // 4)
         length = jnp.full(2, MAX_HALF_LENGTH, self.low.dtype)
         return jnp.append(self.low, -length), jnp.append(self.high, length)
@@ -160,10 +160,10 @@ class FrameResponse(eqx.Module):
         start: Float[Array, " m"],
         max_steps: int,
         options: dict[str, Any] | None = None,
-        shape: Shape = one_row_each,
-    ) -> UnfinishedFit:
+        shape: Shape = contact_rows,
+    ) -> FitState:
         low, high = self._bounds(shape, len(start))
-        found: optx.Solution[Array, Any] = optx.least_squares(
+        solution: optx.Solution[Array, Any] = optx.least_squares(
             _residual,
             SOLVER,
             start,
@@ -173,14 +173,14 @@ class FrameResponse(eqx.Module):
             adjoint=ImplicitStep(),
             throw=False,
         )
-        return UnfinishedFit(found.value, found.state)
+        return FitState(solution.value, solution.state)
 
-    def sensitive(
+    def linearise(
         self, y: Float[Array, " r"], theta: Float[Array, "n 4"], present: Bool[Array, " n"]
     ) -> tuple[Float[Array, "n 4"], Float[Array, "n 4 4"]]:
-        """Contacts with their derivatives with respect to y, and their covariances.
+        """Linearise the fit: contacts with their derivatives with respect to y, and their covariances.
 
-        A Gauss-Newton step from where the search ended changes next to nothing, but has the right derivative.
+        At the minimum a Gauss-Newton step is next to zero, but its derivative is that of the minimum.
         """
         value, slopes = self.response(theta)
         j = jnp.where(present[:, None], slopes, 0).reshape(len(y), -1)
@@ -188,12 +188,12 @@ class FrameResponse(eqx.Module):
         step = inverse(j.T @ (y - value)).reshape(theta.shape)
         covariance = inverse(jnp.eye(theta.size, dtype=y.dtype))
         slot = np.arange(len(theta))
-        own = covariance.reshape(*theta.shape, *theta.shape)[slot, :, slot]
-        return theta + (step - jax.lax.stop_gradient(step)), own
+        blocks = covariance.reshape(*theta.shape, *theta.shape)[slot, :, slot]
+        return theta + (step - jax.lax.stop_gradient(step)), blocks
 
 
 class _FrameProblem(NamedTuple):
-    """The numbers (r,) of a frame, and contacts of some shape that are to explain them."""
+    """The least-squares problem of one frame: its whitened readings (r,), and the shape of the contacts."""
 
     bumps: FrameResponse
     y: Float[Array, " r"]
@@ -205,16 +205,16 @@ def _residual(flat: Float[Array, " m"], problem: _FrameProblem) -> Float[Array, 
 
 
 def _quadratic(flat: Float[Array, " m"], problem: _FrameProblem) -> HalfSquares:
-    """The response knows its slopes."""
+    """Normal equations by the slopes of the response, with no further differentiation of it."""
     theta = problem.shape(flat)
     value, slopes = problem.bumps.response(theta)
     slopes = slopes.reshape(len(value), -1)
-    if problem.shape is not one_row_each:
+    if problem.shape is not contact_rows:
         slopes = slopes @ jax.jacfwd(problem.shape)(flat).reshape(theta.size, -1)
     return normal_equations(problem.y - value, -slopes)
 
 
-def bounds_of(x: np.ndarray, y: np.ndarray, widths: tuple[float, float]) -> dict[str, list[float]]:
+def contact_bounds(x: np.ndarray, y: np.ndarray, widths: tuple[float, float]) -> dict[str, list[float]]:
     """Bounds of x, y, log width and strength."""
     low, high = ([np.min(x), np.min(y), np.log(widths[0]), 0], [np.max(x), np.max(y), np.log(widths[1]), np.inf])
     return {"low": low, "high": high}

@@ -17,8 +17,8 @@ from ..imaging.whitening import Whitened, whitened_readings
 from ..model.bases import Elements
 from ..model.discretisation import Model, require_model
 from ..model.sensitivity import pair_jacobian
-from .bump_responses import Nodes, mean_conductivity, nodes_of, reached, responses_of, tabulate
-from .fit import bounds_of
+from .bump_responses import Nodes, mean_conductivity, signal_subspace, spline_responses, table_nodes, tabulate
+from .fit import contact_bounds
 from .search import ContactFinder
 from .settings import ContactSettings
 
@@ -70,30 +70,31 @@ def prepare_contacts(
             no coating explains the untouched frame.
         SceneError: if ``model`` is no model, such as a skin.
     """
-    sigma, found = sheet_and_readings("prepare_contacts", model, noise, untouched, sigma, channels)
+    sigma, whitened = sheet_and_readings("prepare_contacts", model, noise, untouched, sigma, channels)
     settings = settings or ContactSettings()
-    nodes = nodes_of(model, settings.widths, settings.columns)
-    slopes, background = _slopes(model, found, sigma)
-    seen, beside = reached(tabulate(model, slopes, nodes.fewer(3)))
-    values = tabulate(model, seen.T @ slopes, nodes)
+    nodes = table_nodes(model, settings.widths, settings.columns)
+    slopes, background = _relative_jacobian(model, whitened, sigma)
+    signal, complement = signal_subspace(tabulate(model, slopes, nodes.subsample(3)))
+    values = tabulate(model, signal.T @ slopes, nodes)
     put = partial(jnp.asarray, dtype=model.dtype)
-    bounds = bounds_of(nodes.axes[1], nodes.axes[0], settings.widths)
+    bounds = contact_bounds(nodes.axes[1], nodes.axes[0], settings.widths)
     finder = ContactFinder(
-        whitening=found.whitening,
-        compress=put(seen.T @ found.compress),
-        rest=put(beside.T @ found.compress),
-        responses=responses_of(values, nodes, background, model.dtype),
+        whitening=whitened.whitening,
+        compress=put(signal.T @ whitened.compress),
+        rest=put(complement.T @ whitened.compress),
+        responses=spline_responses(values, nodes, background, model.dtype),
         **{name: put(array) for name, array in (_atoms(model, values, nodes) | bounds).items()},
         threshold=put(0),
         model_error=put(settings.model_error),
         ratio=put(settings.ratio),
         separation=put(settings.separation),
-        root=put(np.eye(seen.shape[1])),
+        root=put(np.eye(signal.shape[1])),
         whole=jnp.asarray(True),
         most=settings.most,
     )
-    ready: ContactFinder = eqx.tree_at(lambda f: f.threshold, finder, put(_threshold(finder, settings.false_alarm)))
-    return ready
+    threshold = put(_threshold(finder, settings.false_alarm))
+    with_threshold: ContactFinder = eqx.tree_at(lambda f: f.threshold, finder, threshold)
+    return with_threshold
 
 
 def sheet_and_readings(
@@ -104,7 +105,7 @@ def sheet_and_readings(
     sigma: Float[Array, " elements"] | None,
     channels: Bool[ArrayLike, " readings"] | None,
 ) -> tuple[Float[Array, " elements"] | None, Whitened]:
-    """Conductivity of the untouched sheet, S, None: even; and what whitens readings, both on the host.
+    """Conductivity of the untouched sheet, S, None: even; and the whitening of readings, both on the host.
 
     Args:
         name: of the function that was called with the others, as `prepare_contacts` describes them.
@@ -116,23 +117,25 @@ def sheet_and_readings(
     return sheet_of(model, untouched, sigma, channels), whitened_readings(model, noise, channels)
 
 
-def _slopes(model: Model, found: Whitened, sigma: Float[Array, " elements"] | None) -> tuple[np.ndarray, float]:
+def _relative_jacobian(
+    model: Model, whitened: Whitened, sigma: Float[Array, " elements"] | None
+) -> tuple[np.ndarray, float]:
     """Whitened readings per relative change of the elements' conductivity, and its mean, S."""
-    slopes = pair_jacobian(model, sigma, Elements().on(model), jnp.asarray(found.electrodes))
-    at = np.asarray(model.background if sigma is None else sigma, float)
-    return found.factor @ (np.asarray(slopes, float) * at), mean_conductivity(model, at)
+    slopes = pair_jacobian(model, sigma, Elements().on(model), jnp.asarray(whitened.electrodes))
+    conductivity = np.asarray(model.background if sigma is None else sigma, float)
+    return whitened.factor @ (np.asarray(slopes, float) * conductivity), mean_conductivity(model, conductivity)
 
 
 def _atoms(model: Model, values: np.ndarray, nodes: Nodes) -> dict[str, np.ndarray]:
-    """The arrays of `Atoms`: narrow, middling and wide bumps all over the sheet."""
+    """Arrays of `Atoms`, by the fields of `ContactFinder`: narrow, medium and wide bumps all over the sheet."""
     y, x, log_width = nodes.axes
-    chosen = []
+    indices = []
     for part in ATOM_WIDTHS:
         level = round(part * (len(log_width) - 1))
         stride = max(1, round(1.3 * np.exp(log_width[level]) / (x[1] - x[0])))
         i, j = np.meshgrid(np.arange(stride // 2, len(y), stride), np.arange(stride // 2, len(x), stride))
-        chosen.append(np.stack([i.ravel(), j.ravel(), np.full(i.size, level)], 1))
-    i, j, level = np.concatenate(chosen).T
+        indices.append(np.stack([i.ravel(), j.ravel(), np.full(i.size, level)], 1))
+    i, j, level = np.concatenate(indices).T
     responses, starts = values[i, j, level], np.stack([x[j], y[i], log_width[level]], 1)
     norms = np.linalg.norm(responses, axis=1)
     kept = (norms > 1e-3 * norms.max()) & _on_sheet(model, starts[:, :2])
@@ -155,29 +158,37 @@ def _on_sheet(model: Model, places: np.ndarray) -> np.ndarray:
 def _threshold(finder: ContactFinder, false_alarm: float) -> float:
     """The fall of chi-square that noise alone exceeds in a part ``false_alarm`` of frames; see `prepare_contacts`."""
     noise = jnp.asarray(np.random.default_rng(0).standard_normal((NOISE_FRAMES, finder.compress.shape[0])))
-    falls = np.sort(np.asarray(_falls(finder, noise.astype(finder.compress.dtype)), float))
+    falls = np.sort(np.asarray(_noise_falls(finder, noise.astype(finder.compress.dtype)), float))
     tenth = max(falls[int(0.9 * NOISE_FRAMES)], 3.0)
     number = -np.log(0.9) / _euler_characteristic(tenth)
-    return _root(lambda z: number * _euler_characteristic(z) + np.log1p(-false_alarm), 2.5, 400)
+    return _bisect(lambda z: number * _euler_characteristic(z) + np.log1p(-false_alarm), 2.5, 400)
 
 
-def _root(falling: Callable[[float], float], low: float, high: float) -> float:
-    """Where a function above zero at ``low`` and below at ``high`` vanishes (scipy.optimize takes 0.1 s to import)."""
+def _bisect(function: Callable[[float], float], low: float, high: float) -> float:
+    """Root of a function above zero at ``low`` and below at ``high`` (scipy.optimize takes 0.1 s to import)."""
     for _ in range(60):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if falling(middle) > 0 else (low, middle)
+        low, high = (middle, high) if function(middle) > 0 else (low, middle)
     return low
 
 
 def _euler_characteristic(square: float) -> float:
-    """Of the places where a Gaussian field in three dimensions exceeds a level of this square, up to a factor."""
+    """Expected Euler characteristic of an excursion set of a Gaussian field in three dimensions, up to a factor.
+
+    Args:
+        square: of the level that the field exceeds.
+    """
     return (square - 1) * float(np.exp(-0.5 * square))
 
 
 @verb
-def _falls(finder: ContactFinder, y: Float[Array, "n r"]) -> Float[Array, " n"]:
-    """Falls of chi-square that one contact makes in frames of noise."""
+def _noise_falls(finder: ContactFinder, y: Float[Array, "n r"]) -> Float[Array, " n"]:
+    """Falls of chi-square by a fit of one contact to frames of noise."""
     bumps, atoms = finder.bumps(finder.root, finder.whole), finder.atom_table(finder.root, finder.whole)
     none = jnp.zeros((0, 4), y.dtype)
-    falls: Array = jax.lax.map(lambda one: one @ one - bumps.fit(one, atoms.one_more(bumps, one, none)).square, y)
+
+    def fall(frame: Float[Array, " r"]) -> Float[Array, ""]:
+        return frame @ frame - bumps.fit(frame, atoms.add_best(bumps, frame, none)).square
+
+    falls: Array = jax.lax.map(fall, y)
     return falls

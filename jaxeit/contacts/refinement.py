@@ -1,4 +1,4 @@
-"""Contacts of one frame fitted again through the full forward map."""
+"""Refinement of the contacts of one frame through the full forward map."""
 
 from typing import Any
 
@@ -16,8 +16,8 @@ from ..least_squares import ImplicitStep
 from ..least_squares.searches import normal_inverse
 from ..model.discretisation import Model
 from ..model.forward_model import conductivity, forward
-from .bump_responses import mean_conductivity, points_of
-from .fit import MAX_STEPS, SOLVER, bounds_of
+from .bump_responses import mean_conductivity, quadrature_points
+from .fit import MAX_STEPS, SOLVER, contact_bounds
 from .preparation import sheet_and_readings
 from .result import ContactResult, Contacts
 
@@ -48,8 +48,8 @@ def refine_contacts(
     """
     require_known("refine_contacts", InverseError, dv, contacts)
     require_real(dv=dv)
-    sigma, found = sheet_and_readings("refine_contacts", model, noise, untouched, sigma, channels)
-    readings, dv, used = model.readings, np.asarray(dv, float), np.asarray(found.whitening.channels)
+    sigma, whitened = sheet_and_readings("refine_contacts", model, noise, untouched, sigma, channels)
+    readings, dv, used = model.readings, np.asarray(dv, float), np.asarray(whitened.whitening.channels)
     if dv.shape != (readings,) or contacts.present.ndim != 1:
         raise InverseError(f"dv has shape {dv.shape}; refine one frame of {readings} readings at a time")
     if not np.isfinite(dv[used]).all():
@@ -59,20 +59,20 @@ def refine_contacts(
         return contacts
     sigma = conductivity(model) if sigma is None else jnp.asarray(sigma, model.dtype)
     chart = np.asarray(model.chart, float)
-    points, weights = (jnp.asarray(a, model.dtype) for a in points_of(model, widths[0] * 2))
+    points, weights = (jnp.asarray(a, model.dtype) for a in quadrature_points(model, widths[0] * 2))
     background = jnp.asarray(mean_conductivity(model, np.asarray(sigma, float)), model.dtype)
-    compress = jnp.asarray(found.compress, model.dtype)
+    compress = jnp.asarray(whitened.compress, model.dtype)
     problem = _ForwardProblem(
-        model, sigma, background, forward(model, sigma), found.whitening, compress, points, weights
+        model, sigma, background, forward(model, sigma), whitened.whitening, compress, points, weights
     )
-    named = [contacts.position, jnp.log(contacts.width)[:, None], contacts.amplitude[:, None]]
-    start = jnp.concatenate(named, 1)[:count].astype(model.dtype)
-    low, high = (jnp.asarray(bound, model.dtype) for bound in bounds_of(chart[:, 0], chart[:, 1], widths).values())
-    return _refined(problem, jnp.asarray(dv, model.dtype), contacts, start, low, high)
+    columns = [contacts.position, jnp.log(contacts.width)[:, None], contacts.amplitude[:, None]]
+    start = jnp.concatenate(columns, 1)[:count].astype(model.dtype)
+    low, high = (jnp.asarray(bound, model.dtype) for bound in contact_bounds(chart[:, 0], chart[:, 1], widths).values())
+    return _fit_forward(problem, jnp.asarray(dv, model.dtype), contacts, start, low, high)
 
 
 class _ForwardProblem(eqx.Module):
-    """Contacts to whitened readings, through the forward map."""
+    """Forward model from contacts to whitened readings, by the full forward map."""
 
     model: Model
     sigma: Float[Array, " elements"]
@@ -83,21 +83,21 @@ class _ForwardProblem(eqx.Module):
     points: Float[Array, "elements q 2"]
     weights: Float[Array, " q"]
 
-    def white(self, dv: Float[Array, " readings"]) -> Float[Array, " r"]:
+    def whiten(self, dv: Float[Array, " readings"]) -> Float[Array, " r"]:
         return self.compress @ self.whitening.sums(dv)
 
     def response(self, flat: Float[Array, " m"]) -> Float[Array, " r"]:
         """Whitened readings of contacts (x, y, log width, amplitude in S)."""
-        touched = sum(self._bump(one) for one in flat.reshape(-1, 4)) / self.background
-        return self.white(forward(self.model, self.sigma * (1 + touched)) - self.untouched)
+        change = sum(self._bump(contact) for contact in flat.reshape(-1, 4)) / self.background
+        return self.whiten(forward(self.model, self.sigma * (1 + change)) - self.untouched)
 
-    def _bump(self, one: Float[Array, "4"]) -> Float[Array, " elements"]:
-        square = jnp.sum((self.points - one[:2]) ** 2, -1)
-        return one[3] * jnp.exp(-0.5 * square * jnp.exp(-2 * one[2])) @ self.weights
+    def _bump(self, contact: Float[Array, "4"]) -> Float[Array, " elements"]:
+        square = jnp.sum((self.points - contact[:2]) ** 2, -1)
+        return contact[3] * jnp.exp(-0.5 * square * jnp.exp(-2 * contact[2])) @ self.weights
 
 
 @verb
-def _refined(
+def _fit_forward(
     problem: _ForwardProblem,
     dv: Float[Array, " readings"],
     contacts: Contacts,
@@ -105,10 +105,10 @@ def _refined(
     low: Float[Array, "4"],
     high: Float[Array, "4"],
 ) -> Contacts:
-    count, y = len(start), problem.white(dv)
+    count, y = len(start), problem.whiten(dv)
     low, high = jnp.tile(low, count), jnp.tile(high, count)
-    found: optx.Solution[Array, Any] = optx.least_squares(
-        lambda flat, of: of[1] - of[0].response(flat),
+    solution: optx.Solution[Array, Any] = optx.least_squares(
+        lambda flat, args: args[1] - args[0].response(flat),
         SOLVER,
         jnp.clip(start.ravel(), low, high),
         (problem, y),
@@ -117,9 +117,9 @@ def _refined(
         adjoint=ImplicitStep(),
         throw=False,
     )
-    misfit = found.state.square / max(len(y) - 4 * count, 1)
-    covariance = _own_covariances(found, count) * jnp.maximum(misfit, 1)
-    theta = found.value.reshape(count, 4)
+    misfit = solution.state.square / max(len(y) - 4 * count, 1)
+    covariance = _contact_covariances(solution, count) * jnp.maximum(misfit, 1)
+    theta = solution.value.reshape(count, 4)
     return Contacts(
         present=contacts.present,
         position=contacts.position.at[:count].set(theta[:, :2]),
@@ -127,19 +127,21 @@ def _refined(
         amplitude=contacts.amplitude.at[:count].set(theta[:, 3]),
         covariance=contacts.covariance.at[:count].set(covariance),
         misfit=misfit,
-        result=contacts.result.at[:count].set(_results(found, low, high)),
+        result=contacts.result.at[:count].set(_results(solution, low, high)),
     )
 
 
-def _results(found: optx.Solution[Array, Any], low: Float[Array, " m"], high: Float[Array, " m"]) -> Int[Array, " n"]:
-    """How the fit of each contact ended."""
-    at_bound = ((found.value <= low) | (found.value >= high)).reshape(-1, 4).any(1)
-    ended = jnp.where(at_bound, ContactResult.AT_BOUND, ContactResult.CONVERGED)
-    return jnp.where(found.state.converged, ended, ContactResult.NOT_CONVERGED)
+def _results(
+    solution: optx.Solution[Array, Any], low: Float[Array, " m"], high: Float[Array, " m"]
+) -> Int[Array, " n"]:
+    """`ContactResult` of each contact."""
+    at_bound = ((solution.value <= low) | (solution.value >= high)).reshape(-1, 4).any(1)
+    converged = jnp.where(at_bound, ContactResult.AT_BOUND, ContactResult.CONVERGED)
+    return jnp.where(solution.state.converged, converged, ContactResult.NOT_CONVERGED)
 
 
-def _own_covariances(found: optx.Solution[Array, Any], count: int) -> Float[Array, "n 4 4"]:
-    """Covariance of the four numbers of each contact, for whitened readings of variance one."""
-    normal = found.state.quadratic.hessian.matrix
+def _contact_covariances(solution: optx.Solution[Array, Any], count: int) -> Float[Array, "n 4 4"]:
+    """Covariance of the four parameters of each contact, for whitened readings of variance one."""
+    normal = solution.state.quadratic.hessian.matrix
     covariance = normal_inverse(normal, jnp.ones(4 * count, bool))(jnp.eye(4 * count, dtype=normal.dtype))
     return covariance.reshape(count, 4, count, 4)[np.arange(count), :, np.arange(count)]

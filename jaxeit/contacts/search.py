@@ -1,8 +1,8 @@
-"""Contacts found directly: position, width and strength of a few bumps that explain a frame.
+"""Search of contacts in a frame by forward selection: position, width and strength of a few bumps.
 
-Bumps are fitted to whitened readings (`fit`), whose response to bumps comes from a table (`bump_responses`): no mesh,
-no solver and no matrix with a row per element is needed when a frame comes. The number of bumps is found by adding one
-after the other.
+Bumps are fitted to whitened readings (`fit`), whose response to bumps comes from a table (`bump_responses`): a frame
+needs no mesh, no solver and no matrix with a row per element. Contacts are added one by one while the fall of
+chi-square is significant.
 """
 
 from collections.abc import Callable
@@ -22,66 +22,66 @@ from ..imaging.inputs import require_frames
 from ..imaging.missing import gap_of, lost_of_frame
 from ..imaging.whitening import Whitening
 from .bump_responses import Responses
-from .fit import ContactFit, FrameResponse, UnfinishedFit, one_row_each
+from .fit import ContactFit, FitState, FrameResponse, contact_rows
 from .result import ContactResult, Contacts
-from .starts import Atoms, lengths_of, split
+from .starts import Atoms, observed_lengths, split_strongest
 
-# Least strength of a contact, over that of the strongest. What is weaker is a ripple of the strongest.
+# Least strength of a contact, over that of the strongest. A weaker one is a ripple of the strongest.
 MIN_RELATIVE_STRENGTH = 0.1
-# A further start is given up if this many more steps, each with the fall that its last step promised, would not make it
-# good enough.
-OUTLOOK = 16
-# Frames of a batch that are searched together where a batch is not done frame by frame; each takes some 30 MB.
-SIDE_BY_SIDE = 256
-# Standard deviations above its mean that chi-square may have in a fit that leaves nothing to explain.
+# Horizon of extrapolation, in steps: a further fit is given up if so many more falls, each as its last step promised,
+# would not make it good enough.
+FALL_HORIZON = 16
+# Number of frames that are searched together where a batch is not searched frame by frame; each takes some 30 MB.
+BATCH_SIZE = 256
+# Largest chi-square of a good fit, in standard deviations above its mean.
 MAX_DEVIATIONS = 4
 
 
 class Frame(NamedTuple):
-    """A frame as it is searched.
+    """Whitened readings of a frame.
 
     | meaning                                                   | shape  |
     |-----------------------------------------------------------|--------|
-    | y: numbers that bumps reach                               | (r,)   |
-    | beside: square of those that no bump reaches              | ()     |
-    | numbers: how many there are of both                       | ()     |
-    | root: mixes responses as missing readings ask for         | (r, r) |
+    | y: in the signal subspace, which bumps reach              | (r,)   |
+    | complement_square: sum of squares in its complement       | ()     |
+    | dimension: of both together                               | ()     |
+    | root: whitens responses if readings are missing           | (r, r) |
     """
 
     y: Float[Array, " r"]
-    beside: Float[Array, ""]
-    numbers: Float[Array, ""]
+    complement_square: Float[Array, ""]
+    dimension: Float[Array, ""]
     root: Float[Array, "r r"]
 
 
-class Found(NamedTuple):
-    """How many contacts, their fit in padded slots, and whether the only one is oblong."""
+class Selection(NamedTuple):
+    """Number of contacts selected, their fit in padded slots, and whether the only one is oblong."""
 
     number: Int[Array, ""]
     fit: ContactFit
     oblong: Bool[Array, ""]
 
 
-# How many fits are finished, and the best of them.
-Tried = tuple[Int[Array, ""] | int, ContactFit]
+# State of the loop over fits of one number of contacts: number of fits finished, and the best of them.
+LoopState = tuple[Int[Array, ""] | int, ContactFit]
 
 
 class ContactFinder(eqx.Module):
     """Frames to contacts, without mesh or solver; from `prepare_contacts`.
 
-    It holds numbers alone: no mesh and no solver. The names of the fields are those in calibration files.
+    It holds arrays alone. The names of the fields are those in calibration files.
 
     | meaning                                                                   | shape        | unit  |
     |---------------------------------------------------------------------------|--------------|-------|
-    | whitening: what is used of a frame                                        |              |       |
-    | compress: from weighted sums to the directions that bumps reach           | (r, k)       | ohm   |
-    | rest: from weighted sums to what whitened readings have beside them       | (r', k)      | ohm   |
+    | whitening: of the readings that are used                                  |              |       |
+    | compress: from weighted sums to the signal subspace, which bumps reach    | (r, k)       | ohm   |
+    | rest: from weighted sums to its complement                                | (r', k)      | ohm   |
     | responses                                                                 |              |       |
-    | atoms, starts, norms, alike: see `Atoms`                                  |              |       |
+    | atoms, starts, norms: see `Atoms`; alike: its Gram matrix                 |              |       |
     | low, high: bounds of x, y, log width, strength                            | (4,), (4,)   |       |
-    | threshold: fall of chi-square that noise alone seldom makes               | ()           |       |
+    | threshold: least significant fall of chi-square                           | ()           |       |
     | model_error: part of the signal that a bump may fail to explain           | ()           | 1     |
-    | ratio: part of what a fit leaves that it must explain more than a simpler one | ()        | 1     |
+    | ratio: fall of the residual over the residual, that a further contact needs | ()         | 1     |
     | separation: least distance of two contacts, in mean widths                | ()           | 1     |
     | root, whole: of a frame without missing readings, see `FrameResponse`     | (r, r), ()   | 1     |
     | most: contacts looked for, K                                              |              |       |
@@ -118,7 +118,7 @@ class ContactFinder(eqx.Module):
         (`imaging.missing`).
 
         On a CPU a batch is done frame by frame, each of which stops as soon as it can, and so is ``jax.vmap`` of a
-        finder. Other devices search `SIDE_BY_SIDE` frames at a time, and ``jax.vmap`` all of them, each of which takes
+        finder. Other devices search `BATCH_SIZE` frames at a time, and ``jax.vmap`` all of them, each of which takes
         some 30 MB.
         """
         require_frames(dv, self.readings)
@@ -130,53 +130,54 @@ class ContactFinder(eqx.Module):
         return self.whitening.channels.shape[0]
 
     def bumps(self, root: Float[Array, "r r"], whole: Bool[Array, ""]) -> FrameResponse:
-        """How the numbers that a frame holds depend on contacts.
+        """Forward model of the signal in a frame.
 
         Args:
-            root, whole: of the frame, as `compressed` gives them: what mixes the responses where readings are missing,
+            root, whole: of the frame, as `compressed` returns them: what whitens the responses if readings are missing,
                 and whether none is.
         """
         return FrameResponse(self.responses, self.low, self.high, root, whole)
 
     def atom_table(self, root: Float[Array, "r r"], whole: Bool[Array, ""]) -> Atoms:
-        """Bumps from which contacts are started, as a frame shows them; ``root`` and ``whole`` as for `bumps`."""
-        lengths = lengths_of(self.atoms, self.norms, root, whole)
+        """Dictionary of the starts of fits in a frame; ``root`` and ``whole`` as for `bumps`."""
+        lengths = observed_lengths(self.atoms, self.norms, root, whole)
         return Atoms(self.atoms, self.starts, self.norms, self.alike, lengths)
 
     def frame(self, dv: Float[Array, " readings"]) -> Contacts:
         """The contacts in one frame, (readings,) V; the finder itself takes any number of frames and checks them."""
-        there = jnp.isfinite(dv) & self.whitening.channels
-        seen, whole = self.compressed(dv)
-        bumps = self.bumps(seen.root, whole)
-        search = _Search(self, bumps, self.atom_table(seen.root, whole), seen.y)
-        found = jax.lax.stop_gradient(search).contacts()  # derivatives: see `FrameResponse.sensitive`
-        return self._contacts(bumps, seen, found, jnp.any(there))
+        finite = jnp.isfinite(dv) & self.whitening.channels
+        frame, whole = self.compressed(dv)
+        bumps = self.bumps(frame.root, whole)
+        search = _Search(self, bumps, self.atom_table(frame.root, whole), frame.y)
+        found = jax.lax.stop_gradient(search).select()  # derivatives: see `FrameResponse.linearise`
+        return self._contacts(bumps, frame, found, jnp.any(finite))
 
     def compressed(self, dv: Float[Array, " readings"]) -> tuple[Frame, Bool[Array, ""]]:
-        """A frame, (readings,) V, as it is searched, and whether no reading that is used is missing (NaN)."""
+        """Whiten a frame, (readings,) V; and whether no reading that is used is missing (NaN)."""
         channels = self.whitening.channels
         whole = jnp.all((jnp.isfinite(dv) & channels) == channels)
-        seen = usually(whole, ContactFinder._complete_frame, ContactFinder._incomplete_frame, self, dv)
-        return seen, whole
+        frame = usually(whole, ContactFinder._complete_frame, ContactFinder._incomplete_frame, self, dv)
+        return frame, whole
 
     def _complete_frame(self, dv: Float[Array, " readings"]) -> Frame:
         sums = self.whitening.sums(dv)
-        y, beside = self.compress @ sums, self.rest @ sums
-        numbers = self.compress.shape[0] + self.rest.shape[0]
-        return Frame(y, beside @ beside, jnp.asarray(numbers, y.dtype), self.root)
+        y, complement = self.compress @ sums, self.rest @ sums
+        dimension = self.compress.shape[0] + self.rest.shape[0]
+        return Frame(y, complement @ complement, jnp.asarray(dimension, y.dtype), self.root)
 
     def _incomplete_frame(self, dv: Float[Array, " readings"]) -> Frame:
         lost = lost_of_frame(self.whitening, dv)
-        seen, every = (gap_of(matrix, lost) for matrix in (self.compress, jnp.concatenate([self.compress, self.rest])))
-        return Frame(seen.y, jnp.maximum(every.y @ every.y - seen.y @ seen.y, 0), every.rank, seen.root)
+        total = jnp.concatenate([self.compress, self.rest])
+        signal, both = (gap_of(matrix, lost) for matrix in (self.compress, total))
+        return Frame(signal.y, jnp.maximum(both.y @ both.y - signal.y @ signal.y, 0), both.rank, signal.root)
 
-    def _contacts(self, bumps: FrameResponse, seen: Frame, found: Found, readable: Bool[Array, ""]) -> Contacts:
-        """What was found as it is handed out, the strongest first."""
+    def _contacts(self, bumps: FrameResponse, frame: Frame, found: Selection, readable: Bool[Array, ""]) -> Contacts:
+        """The selected contacts as results, the strongest first."""
         present = jnp.arange(self.most) < found.number
-        theta, covariance = bumps.sensitive(seen.y, one_row_each(found.fit.flat), present)
-        misfit = (found.fit.square + seen.beside) / jnp.maximum(seen.numbers - 4 * found.number, 1)
-        named, slopes = jax.vmap(self._with_amplitude)(theta), jax.vmap(jax.jacfwd(self._with_amplitude))(theta)
-        own = slopes @ covariance @ slopes.swapaxes(1, 2) * jnp.maximum(misfit, 1)
+        theta, covariance = bumps.linearise(frame.y, contact_rows(found.fit.flat), present)
+        misfit = (found.fit.square + frame.complement_square) / jnp.maximum(frame.dimension - 4 * found.number, 1)
+        parameters, slopes = jax.vmap(self._with_amplitude)(theta), jax.vmap(jax.jacfwd(self._with_amplitude))(theta)
+        covariance = slopes @ covariance @ slopes.swapaxes(1, 2) * jnp.maximum(misfit, 1)
         empty = jnp.where(readable, ContactResult.ABSENT, ContactResult.UNREADABLE)
         order = jnp.argsort(jnp.where(present, -theta[:, 3], jnp.inf))
 
@@ -185,10 +186,10 @@ class ContactFinder(eqx.Module):
 
         return Contacts(
             present=present,
-            position=slots(named[:, :2]),
-            width=slots(jnp.exp(named[:, 2])),
-            amplitude=slots(named[:, 3]),
-            covariance=slots(own),
+            position=slots(parameters[:, :2]),
+            width=slots(jnp.exp(parameters[:, 2])),
+            amplitude=slots(parameters[:, 3]),
+            covariance=slots(covariance),
             misfit=misfit,
             result=jnp.where(present, self._result(found)[order], empty),
         )
@@ -198,144 +199,144 @@ class ContactFinder(eqx.Module):
         factor = self.responses.background * self.responses.scale**2
         return theta.at[3].set(theta[3] * factor * jnp.exp(-2 * theta[2]))
 
-    def _result(self, found: Found) -> Int[Array, " n"]:
-        theta = one_row_each(found.fit.flat)
-        bound = ((theta <= self.low) | (theta >= self.high)).any(1)
-        of_round = jnp.where(bound, ContactResult.AT_BOUND, ContactResult.CONVERGED)
-        of_shape = jnp.where(found.oblong, ContactResult.OBLONG, of_round)
-        return jnp.where(found.fit.converged, of_shape, ContactResult.NOT_CONVERGED)
+    def _result(self, found: Selection) -> Int[Array, " n"]:
+        theta = contact_rows(found.fit.flat)
+        at_bound = ((theta <= self.low) | (theta >= self.high)).any(1)
+        converged = jnp.where(at_bound, ContactResult.AT_BOUND, ContactResult.CONVERGED)
+        shape = jnp.where(found.oblong, ContactResult.OBLONG, converged)
+        return jnp.where(found.fit.converged, shape, ContactResult.NOT_CONVERGED)
 
 
 class _Search(eqx.Module):
-    """The search of one frame, whose numbers are y: see `prepare_contacts` for when it stops."""
+    """Forward selection of contacts in one frame of whitened readings y; `prepare_contacts` has its stopping rules."""
 
     finder: ContactFinder
     bumps: FrameResponse
     atoms: Atoms
     y: Float[Array, " r"]
 
-    def contacts(self) -> Found:
-        """Contacts one by one. Empty slots hold zeros."""
-        found = Found(jnp.asarray(0), self._nothing(), jnp.asarray(False))
-        going = jnp.asarray(True)
+    def select(self) -> Selection:
+        """Add contacts one by one. Empty slots hold zeros."""
+        found = Selection(jnp.asarray(0), self._null_fit(), jnp.asarray(False))
+        active = jnp.asarray(True)
         for n in range(1, self.finder.most + 1):
             fit = found.fit
-            going = going & self._explains(fit.square, jnp.zeros_like(fit.square), n)
-            more = jax.lax.cond(going, self._another(n), lambda fit: fit, fit)
-            distinct = self._are_distinct(one_row_each(more.flat)[:n])
-            going = going & self._explains(fit.square, more.square, n) & distinct
+            active = active & self._is_significant(fit.square, jnp.zeros_like(fit.square), n)
+            larger = jax.lax.cond(active, self._forward_step(n), lambda fit: fit, fit)
+            distinct = self._are_distinct(contact_rows(larger.flat)[:n])
+            active = active & self._is_significant(fit.square, larger.square, n) & distinct
             if n == 2:
-                found, going = jax.lax.cond(
-                    going,
-                    lambda one, two: self._two_or_oblong(one, two),  # a bound method of arrays has no hash
+                found, active = jax.lax.cond(
+                    active,
+                    lambda one, two: self._compare_with_oblong(one, two),  # a bound method of arrays has no hash
                     lambda one, two: (one, jnp.asarray(False)),
                     found,
-                    more,
+                    larger,
                 )
-            more = Found(jnp.asarray(n), more, jnp.asarray(False))
-            found = jax.tree.map(lambda new, old, taken=going: jnp.where(taken, new, old), more, found)
+            candidate = Selection(jnp.asarray(n), larger, jnp.asarray(False))
+            found = jax.tree.map(lambda new, old, accepted=active: jnp.where(accepted, new, old), candidate, found)
         return found
 
-    def _nothing(self) -> ContactFit:
+    def _null_fit(self) -> ContactFit:
+        """The fit of no contact."""
         return ContactFit(jnp.zeros(4 * self.finder.most, self.y.dtype), self.y @ self.y, jnp.asarray(False))
 
-    def _explains(self, before: Float[Array, ""], after: Float[Array, ""], n: int) -> Bool[Array, ""]:
-        """Whether the fall of the square to ``after``, with n contacts, is that of a real contact."""
-        finder, missing = self.finder, jnp.zeros_like(before)
+    def _is_significant(self, before: Float[Array, ""], after: Float[Array, ""], n: int) -> Bool[Array, ""]:
+        """Whether the fall of the square to ``after``, with n contacts, is above that by noise and model error."""
+        finder, model_fall = self.finder, jnp.zeros_like(before)
         if n > 1:
-            unmodelled = finder.model_error**2 * (self.y @ self.y)
-            missing = jnp.maximum(unmodelled, ((n - 1) * finder.ratio) ** 2 * after)
-        return before - after > finder.threshold + missing
+            model_square = finder.model_error**2 * (self.y @ self.y)
+            model_fall = jnp.maximum(model_square, ((n - 1) * finder.ratio) ** 2 * after)
+        return before - after > finder.threshold + model_fall
 
     def _are_distinct(self, theta: Float[Array, "n 4"]) -> Bool[Array, ""]:
-        """Whether contacts lie apart, and none is but a ripple of the strongest."""
+        """Whether contacts are separate, and none is a ripple of the strongest."""
         i, j = np.triu_indices(len(theta), 1)
         distance = jnp.sum((theta[i, :2] - theta[j, :2]) ** 2, 1)
         width, strength = jnp.exp(theta[:, 2]), theta[:, 3]
-        apart = jnp.all(distance > (self.finder.separation * 0.5 * (width[i] + width[j])) ** 2)
-        return apart & jnp.all(strength > MIN_RELATIVE_STRENGTH * jnp.max(strength))
+        separate = jnp.all(distance > (self.finder.separation * 0.5 * (width[i] + width[j])) ** 2)
+        return separate & jnp.all(strength > MIN_RELATIVE_STRENGTH * jnp.max(strength))
 
-    def _two_or_oblong(self, one: Found, two: ContactFit) -> tuple[Found, Bool[Array, ""]]:
-        """Whether two contacts explain clearly more than one oblong contact; if not, what the oblong one says."""
-        line = self.bumps.fit_oblong(self.y, one_row_each(two.flat)[:2])
-        better = self._explains(one.fit.square, line.square, 2)
+    def _compare_with_oblong(self, one: Selection, two: ContactFit) -> tuple[Selection, Bool[Array, ""]]:
+        """The better of one round and one oblong contact, and whether two contacts are significant against it."""
+        line = self.bumps.fit_oblong(self.y, contact_rows(two.flat)[:2])
+        is_oblong = self._is_significant(one.fit.square, line.square, 2)
         square = jnp.exp(2 * line.flat[2]) + jnp.sum(line.flat[4:] ** 2) / 6  # the mean second moment
         flat = one.fit.flat.at[:4].set(line.flat[:4].at[2].set(0.5 * jnp.log(square)))
-        oblong = Found(one.number, ContactFit(flat, line.square, line.converged), better)
-        single = jax.tree.map(lambda a, b: jnp.where(better, a, b), oblong, one)
-        return single, self._explains(line.square, two.square, 2)
+        oblong = Selection(one.number, ContactFit(flat, line.square, line.converged), is_oblong)
+        single = jax.tree.map(lambda a, b: jnp.where(is_oblong, a, b), oblong, one)
+        return single, self._is_significant(line.square, two.square, 2)
 
-    def _another(self, n: int) -> Callable[[ContactFit], ContactFit]:
-        """The fit of n contacts, from that of n - 1."""
+    def _forward_step(self, n: int) -> Callable[[ContactFit], ContactFit]:
+        """The step from a fit of n - 1 contacts to one of n."""
 
-        def fitted(fit: ContactFit) -> ContactFit:
-            theta, y = one_row_each(fit.flat)[: n - 1], self.y
-            one_more = self.atoms.one_more(self.bumps, y, theta)
+        def step(fit: ContactFit) -> ContactFit:
+            theta, y = contact_rows(fit.flat)[: n - 1], self.y
+            start = self.atoms.add_best(self.bumps, y, theta)
             if n == 1:
-                return _padded(self._single(one_more), self.finder.most)
-            starts = jnp.stack([one_more, split(self.bumps, y, theta)])
-            tried = jax.vmap(lambda start: self.bumps.try_out(y, start))(starts)
-            # A quarter of the fall that `_explains` wants: most frames with fewer contacts end their search here.
-            hope = fit.square / (1 + (0.5 * (n - 1) * self.finder.ratio) ** 2)
-            return _padded(self._finished(tried, hope, n), self.finder.most)
+                return _pad(self._fit_single(start), self.finder.most)
+            starts = jnp.stack([start, split_strongest(self.bumps, y, theta)])
+            trials = jax.vmap(lambda start: self.bumps.trial_fit(y, start))(starts)
+            # A quarter of the fall that `_is_significant` needs: most frames with fewer contacts end their search here.
+            aim = fit.square / (1 + (0.5 * (n - 1) * self.finder.ratio) ** 2)
+            return _pad(self._best_fit(trials, aim, n), self.finder.most)
 
-        return fitted
+        return step
 
-    def _single(self, start: Float[Array, "1 4"]) -> ContactFit:
-        """The fit of one contact; where it does not end well, the better of it and of a fit from another start."""
+    def _fit_single(self, start: Float[Array, "1 4"]) -> ContactFit:
+        """The fit of one contact; where it is poor, the better of it and of a fit from an alternative start."""
         y, bumps = self.y, self.bumps
         first = bumps.fit(y, start)
-        allowed = self._allowed()
+        max_square = self._max_square()
 
-        def again() -> ContactFit:
-            begun = bumps.unstarted(y, self.atoms.other(bumps, y))
-            second = bumps.finish(y, begun, jnp.minimum(allowed, first.square), jnp.asarray(OUTLOOK))
+        def restart() -> ContactFit:
+            initial = bumps.init(y, self.atoms.alternative(bumps, y))
+            second = bumps.finish(y, initial, jnp.minimum(max_square, first.square), jnp.asarray(FALL_HORIZON))
             better = second.square < first.square
-            chosen: ContactFit = jax.tree.map(lambda a, b: jnp.where(better, a, b), second, first)
-            return chosen
+            best: ContactFit = jax.tree.map(lambda a, b: jnp.where(better, a, b), second, first)
+            return best
 
-        fit: ContactFit = jax.lax.cond(first.converged & (first.square <= allowed), lambda: first, again)
+        fit: ContactFit = jax.lax.cond(first.converged & (first.square <= max_square), lambda: first, restart)
         return fit
 
-    def _allowed(self) -> Float[Array, ""]:
-        """Chi-square that a fit of all contacts may leave: noise, which seldom leaves four standard deviations above
-        its mean, and model error."""
+    def _max_square(self) -> Float[Array, ""]:
+        """Largest chi-square of a good fit: of noise, `MAX_DEVIATIONS` above its mean, and of model error."""
         y = self.y
         noise = len(y) + MAX_DEVIATIONS * np.sqrt(2 * len(y))
-        allowed: Array = noise + self.finder.model_error**2 * (y @ y)
-        return allowed
+        largest: Array = noise + self.finder.model_error**2 * (y @ y)
+        return largest
 
-    def _finished(self, tried: UnfinishedFit, hope: Float[Array, ""], n: int) -> ContactFit:
-        """The better of two fits begun, finished, or the first further one that leaves no more than noise and model
-        error may. Where no fit leaves so little, something else is wrong, and it is not for more contacts to explain.
+    def _best_fit(self, trials: FitState, aim: Float[Array, ""], n: int) -> ContactFit:
+        """Finish the better of two trial fits, and further ones until a fit is good (`_max_square`).
 
-        Further fits are the other of the two and, for two contacts, the one from the best pair of atoms.
+        Further fits are the other trial and, for two contacts, the one from the best pair of atoms. Where none is good,
+        the first one is returned: the frame has another fault, which more contacts must not explain.
         """
-        y, bumps, allowed = self.y, self.bumps, self._allowed()
-        better = jnp.argmin(tried.square)
-        most = 2 + (n == 2)
+        y, bumps, max_square = self.y, self.bumps, self._max_square()
+        better = jnp.argmin(trials.square)
+        max_fits = 2 + (n == 2)
 
-        def unfinished(state: Tried) -> Bool[Array, ""]:
+        def is_unfinished(state: LoopState) -> Bool[Array, ""]:
             k, fit = state
-            going: Bool[Array, ""] = (k == 0) | (k < most) & (fit.square > allowed)
-            return going
+            unfinished: Bool[Array, ""] = (k == 0) | (k < max_fits) & (fit.square > max_square)
+            return unfinished
 
-        def finish_next(state: Tried) -> Tried:
+        def finish_next(state: LoopState) -> LoopState:
             k, before = state
-            begun = jax.tree.map(lambda leaf: leaf[(better + k) % 2], tried)
+            iterate = jax.tree.map(lambda leaf: leaf[(better + k) % 2], trials)
             if n == 2:
-                begun = jax.lax.cond(k < 2, lambda: begun, lambda: bumps.unstarted(y, self.atoms.pair(bumps, y)))
+                iterate = jax.lax.cond(k < 2, lambda: iterate, lambda: bumps.init(y, self.atoms.pair(bumps, y)))
             first = k == 0
-            fit = bumps.finish(y, begun, jnp.where(first, hope, allowed), jnp.where(first, 0, OUTLOOK))
-            taken = first | (fit.square <= allowed)
-            return k + 1, jax.tree.map(lambda new, old: jnp.where(taken, new, old), fit, before)
+            fit = bumps.finish(y, iterate, jnp.where(first, aim, max_square), jnp.where(first, 0, FALL_HORIZON))
+            accepted = first | (fit.square <= max_square)
+            return k + 1, jax.tree.map(lambda new, old: jnp.where(accepted, new, old), fit, before)
 
-        none_yet: Tried = (0, jax.tree.map(lambda leaf: leaf[0], tried).fit)
-        return jax.lax.while_loop(unfinished, finish_next, none_yet)[1]
+        initial: LoopState = (0, jax.tree.map(lambda leaf: leaf[0], trials).fit)
+        return jax.lax.while_loop(is_unfinished, finish_next, initial)[1]
 
 
-def _padded(fit: ContactFit, most: int) -> ContactFit:
-    """In as many slots as there may be contacts, so that fits of any number are alike."""
+def _pad(fit: ContactFit, most: int) -> ContactFit:
+    """Pad a fit to the slots of all contacts, so that fits of any number have one shape."""
     return fit._replace(flat=jnp.pad(fit.flat, (0, 4 * most - len(fit.flat))))
 
 
@@ -353,7 +354,7 @@ def _find(finder: ContactFinder, frames: Float[Array, "... readings"]) -> Contac
     found: Contacts = by_platform(
         each_frame,
         cpu=lambda frames: jax.lax.map(each, frames),
-        default=lambda frames: jax.lax.map(each, frames, batch_size=SIDE_BY_SIDE),
+        default=lambda frames: jax.lax.map(each, frames, batch_size=BATCH_SIZE),
     )
     found = jax.tree.map(lambda a: a.reshape(*batch, *a.shape[1:]), found)
     return found

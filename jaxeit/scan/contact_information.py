@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Integer
 
 from .._compile import require_known, verb
 from ..budget import require
-from ..contacts.bump_responses import rule_of
+from ..contacts.bump_responses import quadrature_rule
 from ..linalg import lapack
 from ..model.bases import Pixels
 from ..model.discretisation import Model
@@ -223,7 +223,7 @@ class SiteContacts(eqx.Module):
         extent = float(np.linalg.norm(np.ptp(np.asarray(model.chart), axis=0))) / settings.width  # it is on the sheet
         prior = np.array([extent, extent, settings.strength_spread, settings.width_spread]) ** -2
         errors = (noise, settings.relative, settings.model_error)
-        numbers = (sites, *rule_of(model, settings.width), settings.width, settings.strength, *errors, prior)
+        numbers = (sites, *quadrature_rule(model, settings.width), settings.width, settings.strength, *errors, prior)
         return SiteContacts(*(jnp.asarray(number, model.dtype) for number in numbers))
 
     @verb

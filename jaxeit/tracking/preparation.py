@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from scipy.spatial import cKDTree
 
 from .._compile import full_precision, verb
-from ..contacts.bump_responses import points_of
+from ..contacts.bump_responses import quadrature_points
 from ..contacts.preparation import prepare_contacts
 from ..contacts.settings import ContactSettings
 from ..fusion import pad_masks
@@ -110,7 +110,7 @@ def _loaded_sheet(
     mean, masks, (points, weights) = (
         _nearest_values(model, sigma, np.asarray(coarse.centroids, float)),
         pad_masks(skin, fine),
-        points_of(coarse, loads.width),
+        quadrature_points(coarse, loads.width),
     )
     centres = np.asarray(fine.centres, float)
     chart, middles = np.asarray(coarse.chart, float), np.asarray(coarse.centroids, float)

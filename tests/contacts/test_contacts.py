@@ -9,7 +9,7 @@ from scipy.stats import binom
 
 import jaxeit as je
 from jaxeit.contacts import ContactResult, ContactSettings, prepare_contacts, refine_contacts, search, strongest
-from jaxeit.contacts.bump_responses import nodes_of, points_of, tabulate
+from jaxeit.contacts.bump_responses import quadrature_points, table_nodes, tabulate
 from jaxeit.imaging.inputs import InverseError
 
 from ..helpers import spread_stacks
@@ -169,7 +169,7 @@ def test_many_frames_mapped_wait_for_no_thread(single):
 def test_other_devices_search_so_many_frames_side_by_side(single, linear, monkeypatch):
     frames = np.stack([0.02 * linear((0.05 + 0.02 * k, 0.08), 0.01) for k in range(5)]) + _noise(5)
     alone = single(frames)
-    monkeypatch.setattr(search, "SIDE_BY_SIDE", 2)
+    monkeypatch.setattr(search, "BATCH_SIZE", 2)
     monkeypatch.setattr(search, "by_platform", lambda *args, cpu, default: default(*args))
     together = single(frames[None])  # of another shape, for which nothing is compiled yet
     assert together.position.shape == (1, 5, 1, 2)
@@ -348,12 +348,12 @@ def test_a_contact_over_a_dead_electrode_is_found_there(finder, other, skin):
 
 def test_a_table_of_responses_is_the_sum_over_all_elements(model):
     """Elements that a bump does not reach are left out of its row."""
-    nodes = nodes_of(model, (0.005, 0.03), 17)
+    nodes = table_nodes(model, (0.005, 0.03), 17)
     slopes = np.random.default_rng(0).normal(size=(3, len(model.triangles)))
     found = tabulate(model, slopes, nodes)
     for i, j, level in [(0, 0, 0), (7, 3, 1), (8, 16, 4), (16, 9, len(nodes.axes[2]) - 1)]:
         centre, width = np.array([nodes.axes[1][j], nodes.axes[0][i]]), np.exp(nodes.axes[2][level])
-        points, weights = points_of(model, width)
+        points, weights = quadrature_points(model, width)
         height = np.exp(-0.5 * ((points - centre) ** 2).sum(-1) / width**2) @ weights
         expected = (nodes.scale / width) ** 2 * slopes @ height
         np.testing.assert_allclose(found[i, j, level], expected, rtol=0, atol=1e-7 * np.abs(found[..., level, :]).max())

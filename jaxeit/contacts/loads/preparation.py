@@ -14,7 +14,7 @@ from ..._compile import full_precision, verb
 from ...model.discretisation import Model
 from ...model.forward_model import coefficients, conductivity, transfer
 from ...model.gaussian_field import field_modes
-from ..bump_responses import mean_conductivity, points_of
+from ..bump_responses import mean_conductivity, quadrature_points
 from ..preparation import sheet_and_readings
 from .belief import LoadBelief
 from .fitter import LoadFitter
@@ -99,7 +99,7 @@ def _sheet(
 ) -> PressedSheet:
     """The sheet under loads, with the modes of all that is not known of it."""
     put = partial(jnp.asarray, dtype=model.dtype)
-    points, weights = points_of(model, settings.width)
+    points, weights = quadrature_points(model, settings.width)
     centroids = np.einsum("q,eqd->ed", weights, points)
     gain, known_gain = settings.gain * field_modes(centroids, settings.gain_length), None
     if known is not None:
