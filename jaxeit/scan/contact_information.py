@@ -1,4 +1,4 @@
-"""What each four-terminal reading tells of the place of a contact, for contacts all over the sheet.
+"""Information of each four-terminal reading on the place of a contact, for contacts all over the sheet.
 
 A contact changes the conductivity of the sheet by ``sigma_0 a g(r - p; s)``, g a Gaussian bump of height one. Its place
 p is wanted; its strength a and width s are nuisances. By linearity and reciprocity each reading is a difference of four
@@ -28,7 +28,7 @@ from ..model.discretisation import Model
 from ..model.forward_model import coefficients, fields, four_terminal, series_slopes, terminal_matrix, transfer
 from ..skin.protocol import ProtocolError
 
-Numbers = np.ndarray | Array
+RealArray = np.ndarray | Array
 UNKNOWNS = 4
 """Unknowns of a contact: place x and y in units of its width, log strength, log width."""
 NOISE_DB = 60.0
@@ -115,7 +115,7 @@ class PlaceSensitivity(eqx.Module):
         """Derivatives of readings with respect to the unknowns of a contact, in units of the error of each reading."""
         std = jnp.sqrt(self.noise**2 + (self.relative * self.voltages(pattern)) ** 2)
         found: Array = four_terminal(self.slopes, jnp.asarray(pattern)) / std
-        change = found[:, 2:3]  # with respect to log strength: the change by the contact itself
+        change = found[:, 2:3]  # derivative with respect to log strength: the signal of the contact itself
         found = found / jnp.sqrt(1 + (self.model_error * change) ** 2)
         return found
 
@@ -150,17 +150,17 @@ def _errors(
     return sensitivity.width * jnp.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
 
 
-def _rms(values: Numbers) -> float:
+def _rms(values: RealArray) -> float:
     return float(np.sqrt(np.mean(np.asarray(values) ** 2)))
 
 
 def inverse_information(information: Float[Array, "s 4 4"]) -> Float[Array, "s 4 4"]:
     """Covariance of all unknowns at each site."""
 
-    def solved(m: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
+    def inverse(m: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
         return lapack.cho_solve(lapack.cho_factor(m, lower=True), jnp.eye(UNKNOWNS, dtype=m.dtype))
 
-    found: Array = jax.vmap(solved)(information)
+    found: Array = jax.vmap(inverse)(information)
     return found
 
 
@@ -179,11 +179,11 @@ def place_sensitivity(model: Model, settings: DesignSettings | None = None) -> P
     """
     require_known("place_sensitivity", ProtocolError, model)
     settings = settings or DesignSettings()
-    return SiteContacts.of(model, settings, sites_of(model, settings.columns)).sensitivity(model, model.chart)
+    return SiteContacts.of(model, settings, sheet_sites(model, settings.columns)).sensitivity(model, model.chart)
 
 
-def sites_of(model: Model, columns: int) -> Float[np.ndarray, "sites 2"]:
-    """Middles of the pixels that lie on the sheet by more than half, m."""
+def sheet_sites(model: Model, columns: int) -> Float[np.ndarray, "sites 2"]:
+    """Centres of the pixels of which more than half lies on the sheet, m."""
     pixels = Pixels(columns).on(model)
     areas = np.asarray(pixels.areas)
     found: np.ndarray = np.asarray(pixels.centres, float)[areas > 0.5 * areas.max()]
@@ -223,8 +223,8 @@ class SiteContacts(eqx.Module):
         extent = float(np.linalg.norm(np.ptp(np.asarray(model.chart), axis=0))) / settings.width  # it is on the sheet
         prior = np.array([extent, extent, settings.strength_spread, settings.width_spread]) ** -2
         errors = (noise, settings.relative, settings.model_error)
-        numbers = (sites, *quadrature_rule(model, settings.width), settings.width, settings.strength, *errors, prior)
-        return SiteContacts(*(jnp.asarray(number, model.dtype) for number in numbers))
+        arrays = (sites, *quadrature_rule(model, settings.width), settings.width, settings.strength, *errors, prior)
+        return SiteContacts(*(jnp.asarray(array, model.dtype) for array in arrays))
 
     @verb
     def sensitivity(self, model: Model, chart: Float[Array, "nodes 2"]) -> PlaceSensitivity:
@@ -235,12 +235,12 @@ class SiteContacts(eqx.Module):
         products = jnp.einsum("era,erb->eab", gradients, gradients)
         resistances = series_slopes(model.system, theta)
         corners = chart[model.triangles]
-        own = np.arange(model.electrodes)
+        diagonal = np.arange(model.electrodes)
 
         def slopes(site: Float[Array, "2"]) -> Float[Array, "4 electrodes electrodes"]:
             change = model.background * self._bump(corners, site)
             found = -jnp.einsum("ke,eab->kab", change, products)
-            return found.at[:, own, own].add(change @ resistances.T)
+            return found.at[:, diagonal, diagonal].add(change @ resistances.T)
 
         found = self.strength * model.current * jax.lax.map(slopes, self.sites)
         z = model.current * terminal_matrix(model, theta, x)
@@ -252,6 +252,6 @@ class SiteContacts(eqx.Module):
         """Mean over each element of a bump's derivatives with respect to the unknowns."""
         x, y = jnp.moveaxis((jnp.einsum("qk,ekd->eqd", self.rule, corners) - site) / self.width, -1, 0)
         square = x**2 + y**2
-        of_each = jnp.exp(-0.5 * square) * jnp.stack([x, y, jnp.ones_like(x), square])
-        found: Array = of_each @ self.weights
-        return found
+        derivatives = jnp.exp(-0.5 * square) * jnp.stack([x, y, jnp.ones_like(x), square])
+        means: Array = derivatives @ self.weights
+        return means

@@ -57,11 +57,11 @@ def signal_covariance(
         InverseError: if the noise is not one positive number per reading that is used, or no reading is used.
     """
     image = basis if isinstance(basis, BasisMap) else (basis or Pixels()).on(model)
-    flat = jnp.ones(image.size, model.dtype) if region is None else jnp.asarray(region, model.dtype)
-    return covariance_of_region(model, prior or Noser(), image, noise, hyperparameter, sigma, channels)(flat)
+    weights = jnp.ones(image.size, model.dtype) if region is None else jnp.asarray(region, model.dtype)
+    return region_covariance(model, prior or Noser(), image, noise, hyperparameter, sigma, channels)(weights)
 
 
-def covariance_of_region(
+def region_covariance(
     model: Model,
     prior: AbstractPrior,
     image: BasisMap,
@@ -78,11 +78,13 @@ def covariance_of_region(
     used = np.ones(model.readings, bool) if channels is None else known_flags(channels, model.readings)
     weight = jnp.asarray(noise_weight(noise, model.readings, require_some(used)))
     strength = jnp.asarray(hyperparameter, model.dtype)
-    return partial(_signal, jacobian(model, sigma, image), weight.astype(model.dtype), prior, strength, image)
+    return partial(
+        _signal_covariance, jacobian(model, sigma, image), weight.astype(model.dtype), prior, strength, image
+    )
 
 
 @verb
-def _signal(
+def _signal_covariance(
     j: Float[Array, "readings basis"],
     weight: Float[Array, " readings"],
     prior: AbstractPrior,
@@ -95,12 +97,12 @@ def _signal(
     precision = problem.precision()
     strength = problem.strength(precision.solve(j.T))
 
-    def within(region: Float[Array, " basis"]) -> Float[Array, "readings readings"]:
-        part = j * jnp.sqrt(region)
-        return part @ precision.solve(part.T) / strength
+    def of_region(region: Float[Array, " basis"]) -> Float[Array, "readings readings"]:
+        weighted = j * jnp.sqrt(region)
+        return weighted @ precision.solve(weighted.T) / strength
 
-    several: Array = jax.lax.map(within, region.reshape(-1, image.size))
-    return several.reshape(*region.shape[:-1], *several.shape[1:])
+    covariances: Array = jax.lax.map(of_region, region.reshape(-1, image.size))
+    return covariances.reshape(*region.shape[:-1], *covariances.shape[1:])
 
 
 def around(

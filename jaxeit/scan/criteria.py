@@ -1,4 +1,4 @@
-"""What a scan is judged by: functions of the covariance of the place of a contact."""
+"""Optimality criteria of a scan: functions of the covariance of the place of a contact."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -30,8 +30,8 @@ class AbstractCriterion(AbstractChoice):
 
     def mean(self, covariance: Float[Array, "n 4 4"]) -> Float[Array, ""]:
         """The mean of h over covariances of the unknowns of contacts."""
-        nothing = jnp.zeros(1, covariance.dtype)
-        return jnp.mean(jax.vmap(lambda c: self.after(c[:2, :2], nothing))(covariance))
+        zero = jnp.zeros(1, covariance.dtype)
+        return jnp.mean(jax.vmap(lambda c: self.after(c[:2, :2], zero))(covariance))
 
 
 class PlaceError(AbstractCriterion):

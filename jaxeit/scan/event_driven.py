@@ -1,4 +1,4 @@
-"""Event-driven scans: pressure and the last contacts select the next readings."""
+"""Event-driven scans: pressure and the latest contacts select the next readings."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from ..model.bases import AbstractBasis, BasisMap, Pixels
 from ..model.discretisation import Model
 from ..skin.description import Skin
 from ..skin.protocol import ProtocolError
-from .covariance import around, covariance_of_region
+from .covariance import around, region_covariance
 from .selection import AbstractSelection, choose_readings
 
 
@@ -94,11 +94,11 @@ class EventScan(eqx.Module):
         if places is None:
             return jnp.zeros_like(self.idle), jnp.zeros(len(self.by_pad), bool)
         places = jnp.asarray(places, self.centres.dtype)
-        there = jnp.isfinite(places).all(-1)
-        square = jnp.sum((jnp.where(there[:, None], places, 0)[:, None] - self.centres) ** 2, -1)
+        present = jnp.isfinite(places).all(-1)
+        square = jnp.sum((jnp.where(present[:, None], places, 0)[:, None] - self.centres) ** 2, -1)
         nearest = jnp.argmin(square, 1)
-        known = jnp.any(self.by_place[nearest] & there[:, None], 0)
-        return known, jnp.any(self.pad_of[nearest] & there[:, None], 0)
+        known = jnp.any(self.by_place[nearest] & present[:, None], 0)
+        return known, jnp.any(self.pad_of[nearest] & present[:, None], 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,13 +145,13 @@ class EventScanSettings:
         Raises:
             ProtocolError: if they are not finite and above zero, or a release is above its onset.
         """
-        begins = np.broadcast_to(np.asarray(self.onset, float), pads)
-        ends = begins / 2 if self.release is None else np.broadcast_to(np.asarray(self.release, float), pads)
-        if not (np.isfinite(begins).all() and (ends > 0).all() and (begins >= ends).all()):
+        onset = np.broadcast_to(np.asarray(self.onset, float), pads)
+        release = onset / 2 if self.release is None else np.broadcast_to(np.asarray(self.release, float), pads)
+        if not (np.isfinite(onset).all() and (release > 0).all() and (onset >= release).all()):
             raise ProtocolError(
-                f"onset is {begins} and release {ends} Pa; give finite ones above 0, onset no less than release"
+                f"onset is {onset} and release {release} Pa; give finite ones above 0, onset no less than release"
             )
-        return begins, ends
+        return onset, release
 
 
 def prepare_event_scan(
@@ -192,21 +192,21 @@ def prepare_event_scan(
     given = model, settings.onset, settings.release, noise, hyperparameter, sigma, channels
     require_known("prepare_event_scan", ProtocolError, *given)
     _require_pads(skin)
-    begins, ends = settings.limits(len(skin.pads))
+    onset, release = settings.limits(len(skin.pads))
     image = basis if isinstance(basis, BasisMap) else (basis or Pixels(20)).on(model)
-    centres = _grid(skin.domain, settings.radius)
+    centres = _region_centres(skin.domain, settings.radius)
     places = jnp.stack([around(image.picture, centre, settings.radius) for centre in centres])
-    expected = covariance_of_region(model, Noser(), image, noise, hyperparameter, sigma, channels)
-    useful = np.arange(model.readings) if channels is None else np.flatnonzero(np.asarray(channels))
-    chosen = partial(_chosen_readings, model, settings, expected, useful)
+    covariance = region_covariance(model, Noser(), image, noise, hyperparameter, sigma, channels)
+    usable = np.arange(model.readings) if channels is None else np.flatnonzero(np.asarray(channels))
+    choose = partial(_region_readings, model, settings, covariance, usable)
     return EventScan(
-        idle=chosen(jnp.ones((1, image.size)), settings.idle)[0],
-        by_pad=chosen(pad_masks(skin, image).weights, settings.local),
-        by_place=chosen(places, settings.local),
+        idle=choose(jnp.ones((1, image.size)), settings.idle)[0],
+        by_pad=choose(pad_masks(skin, image).weights, settings.local),
+        by_place=choose(places, settings.local),
         centres=jnp.asarray(centres, model.dtype),
         pad_of=jnp.asarray(skin.pads_at(centres).T),
-        onset=jnp.asarray(begins, model.dtype),
-        release=jnp.asarray(ends, model.dtype),
+        onset=jnp.asarray(onset, model.dtype),
+        release=jnp.asarray(release, model.dtype),
         every=jnp.asarray(settings.every),
     )
 
@@ -220,29 +220,29 @@ def _require_pads(skin: Skin) -> None:
     skin.protocol.rows("an event-driven scan")
 
 
-def _chosen_readings(
+def _region_readings(
     model: Model,
     settings: EventScanSettings,
-    expected: Callable[[Float[Array, " basis"]], Float[Array, "readings readings"]],
-    useful: Int[np.ndarray, " n"],
+    covariance: Callable[[Float[Array, " basis"]], Float[Array, "readings readings"]],
+    usable: Int[np.ndarray, " n"],
     regions: Float[Array, "regions basis"],
     count: int,
 ) -> Bool[Array, "regions readings"]:
-    """The useful readings to take for each region, of which it shows most: ``count`` of them, or all.
+    """Choose the usable readings that inform most on each region: ``count`` of them, or all.
 
     Args:
-        expected: covariance of the readings, of changes in a region.
+        covariance: of the readings by changes in a region.
     """
-    pattern, count = model.pattern[useful], min(count, len(useful))
-    covariances = (expected(region.astype(model.dtype))[useful][:, useful] for region in regions)
+    pattern, count = model.pattern[usable], min(count, len(usable))
+    covariances = (covariance(region.astype(model.dtype))[usable][:, usable] for region in regions)
     rows = [
         choose_readings(k, count, settings.selection, pattern=pattern, switch=settings.switch).rows for k in covariances
     ]
     none = jnp.zeros((len(rows), model.readings), bool)
-    return none.at[jnp.arange(len(rows))[:, None], jnp.asarray(useful)[jnp.stack(rows)]].set(True)
+    return none.at[jnp.arange(len(rows))[:, None], jnp.asarray(usable)[jnp.stack(rows)]].set(True)
 
 
-def _grid(domain: Domain, pitch: float) -> Float[np.ndarray, "regions 2"]:
+def _region_centres(domain: Domain, pitch: float) -> Float[np.ndarray, "regions 2"]:
     """Centres of equal cells, with sides of at most ``pitch`` m, that lie on the sheet."""
     low, high = np.asarray(domain.bounds)
     cells = np.ceil((high - low) / pitch).astype(int)

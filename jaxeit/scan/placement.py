@@ -1,4 +1,4 @@
-"""Where the electrodes of a skin should sit, so that a scan places contacts best.
+"""Optimal placement of the electrodes of a skin for the localisation of contacts by its scan.
 
 The error of place that a scan promises (`contact_information`) is a smooth function of the electrodes' positions: the
 mesh follows them (`model.motion`), the contacts stay where they are. Sequential quadratic programming (Kraft 1988,
@@ -26,15 +26,15 @@ from ..model.scene import Scene
 from ..skin.description import Skin
 from ..skin.protocol import ProtocolError
 from ..skin.rewriting import with_positions
-from .contact_information import DesignSettings, SiteContacts, sites_of
+from .contact_information import DesignSettings, SiteContacts, sheet_sites
 from .criteria import AbstractCriterion, PlaceError
 
-STEP = 0.2  # of an electrode's reach, that it moves at most on one mesh
-LEAST_STEP = 0.02  # likewise, below which the search ends
-LEAST_GAIN = 5e-3  # part of the error, by which a mesh must lower it for the search to go on
-ITERATIONS, TOLERANCE = 25, 1e-3  # of the search on one mesh
-SLACK = 1e-9  # m, by which places may break a limit
-MIRRORED = 1e-3  # of the sheet's size, within which a mirrored electrode is another one
+MAX_STEP = 0.2  # largest step of an electrode on one mesh, over its reach
+MIN_STEP = 0.02  # likewise, below which the search ends
+MIN_RELATIVE_GAIN = 5e-3  # least fall of the error by a mesh, over the error; with less the search ends
+MAX_ITERATIONS, FALL_TOLERANCE = 25, 1e-3  # of the search on one mesh
+LIMIT_ATOL = 1e-9  # m, by which places may violate a limit
+MIRROR_TOLERANCE = 1e-3  # largest distance of a mirrored electrode from its partner, over the sheet's size
 
 
 @dataclass(frozen=True)
@@ -123,17 +123,17 @@ def move_electrodes(
     criterion, limits = criterion or PlaceError(), limits or PlacementLimits()
     settings, fidelity = settings or DesignSettings(), fidelity or Fidelity.draft()
     pattern = np.asarray(skin.protocol.rows("move_electrodes") if pattern is None else pattern)
-    search = _Search.begin(skin, criterion, limits, settings, pattern, fidelity)
-    first, share, made = search.error, STEP, 1
+    search = _Search.start(skin, criterion, limits, settings, pattern, fidelity)
+    first, share, made = search.error, MAX_STEP, 1
     for _ in progress(range(meshes - 1)):
         after, made = search.step(share), made + 1
         if after.value < search.value:
             gain, search = 1 - after.error / search.error, after
-            if gain < LEAST_GAIN:
+            if gain < MIN_RELATIVE_GAIN:
                 break
         else:
             share *= 0.5
-            if share < LEAST_STEP:
+            if share < MIN_STEP:
                 break
     return Placement(search.skin, first, search.error, made)
 
@@ -166,8 +166,8 @@ class _Search:
     |---------------------------------------------------------------|------------------------------|------|
     | skin, limits, fidelity: as given, the electrodes moved        |                              |      |
     | objective, and its value                                      |                              |      |
-    | home: places of the electrodes at the beginning               | (electrodes, 2)              | m    |
-    | mirror: projects shifts to those that keep the symmetry       | (2 electrodes, 2 electrodes) | 1    |
+    | initial: places of the electrodes before the search           | (electrodes, 2)              | m    |
+    | projection: of shifts to those that keep the symmetry         | (2 electrodes, 2 electrodes) | 1    |
     """
 
     skin: Skin
@@ -175,11 +175,11 @@ class _Search:
     fidelity: Fidelity
     objective: _Objective
     value: float
-    home: np.ndarray
-    mirror: np.ndarray
+    initial: np.ndarray
+    projection: np.ndarray
 
     @staticmethod
-    def begin(
+    def start(
         skin: Skin,
         criterion: AbstractCriterion,
         limits: PlacementLimits,
@@ -187,21 +187,21 @@ class _Search:
         pattern: np.ndarray,
         fidelity: Fidelity,
     ) -> "_Search":
-        """The electrodes where they sit; raises ProtocolError if they break the limits there."""
-        home = np.asarray(skin.electrode_positions, float)
+        """The search at the present places; raises ProtocolError if they break the limits."""
+        initial = np.asarray(skin.electrode_positions, float)
         if limits.margin is None:
-            limits = replace(limits, margin=float(skin.domain.boundary_distance(home).min()))
-        slack = np.min(_slack(skin, limits, home, home))  # before anything is computed
-        if slack < -SLACK:
+            limits = replace(limits, margin=float(skin.domain.boundary_distance(initial).min()))
+        slack = np.min(_constraints(skin, limits, initial, initial))  # before anything is computed
+        if slack < -LIMIT_ATOL:
             raise ProtocolError(
                 f"{skin.name}: the electrodes break the limits where they sit now, by {-1e3 * slack:.3g} mm; give a "
                 "smaller distance or margin, or other circles to keep out of"
             )
-        mirror = _mirror(skin, home) if limits.symmetric else np.eye(2 * len(home))
+        projection = _symmetry_projection(skin, initial) if limits.symmetric else np.eye(2 * len(initial))
         model = discretise(Scene(skin), fidelity)
-        contacts = SiteContacts.of(model, settings, sites_of(model, settings.columns))
+        contacts = SiteContacts.of(model, settings, sheet_sites(model, settings.columns))
         objective = _Objective(criterion, model, electrode_motion(model), contacts, jnp.asarray(pattern, jnp.int32))
-        return _Search(skin, limits, fidelity, objective, _value(objective), home, mirror)
+        return _Search(skin, limits, fidelity, objective, _value(objective), initial, projection)
 
     @property
     def error(self) -> float:
@@ -210,44 +210,44 @@ class _Search:
 
     def step(self, share: float) -> "_Search":
         """The electrodes at better places, each at most this share of its reach away in x and y, on a new mesh."""
-        here, objective = np.asarray(self.skin.electrode_positions, float), self.objective
+        positions, objective = np.asarray(self.skin.electrode_positions, float), self.objective
         size, unit = share * float(np.min(np.asarray(objective.motion.reach))), abs(self.value)
 
         def shift(u: np.ndarray) -> np.ndarray:
-            return np.asarray(size * (self.mirror @ u).reshape(-1, 2))
+            return np.asarray(size * (self.projection @ u).reshape(-1, 2))
 
-        def slack(u: np.ndarray) -> np.ndarray:
-            return _slack(self.skin, self.limits, self.home, here + shift(u)) / size
+        def constraints(u: np.ndarray) -> np.ndarray:
+            return _constraints(self.skin, self.limits, self.initial, positions + shift(u)) / size
 
-        def fall(u: np.ndarray) -> tuple[float, np.ndarray]:
+        def relative_change(u: np.ndarray) -> tuple[float, np.ndarray]:
             value, slope = objective(jnp.asarray(shift(u), objective.model.dtype))
-            by_u = size * self.mirror.T @ np.asarray(slope, float).ravel()
+            by_u = size * self.projection.T @ np.asarray(slope, float).ravel()
             return (float(value) - self.value) / unit, by_u / unit
 
-        found = minimize(
-            fall,
-            np.zeros(here.size),
+        solution = minimize(
+            relative_change,
+            np.zeros(positions.size),
             jac=True,
             method="SLSQP",
-            bounds=[(-1.0, 1.0)] * here.size,
-            constraints={"type": "ineq", "fun": slack},
-            options={"maxiter": ITERATIONS, "ftol": TOLERANCE},
+            bounds=[(-1.0, 1.0)] * positions.size,
+            constraints={"type": "ineq", "fun": constraints},
+            options={"maxiter": MAX_ITERATIONS, "ftol": FALL_TOLERANCE},
         )
-        skin = with_positions(self.skin, here + shift(found.x))
+        skin = with_positions(self.skin, positions + shift(solution.x))
         model = discretise(Scene(skin), self.fidelity)
-        there = replace(objective, model=model, motion=electrode_motion(model))
-        return replace(self, skin=skin, objective=there, value=_value(there))
+        next_objective = replace(objective, model=model, motion=electrode_motion(model))
+        return replace(self, skin=skin, objective=next_objective, value=_value(next_objective))
 
 
-def _slack(skin: Skin, limits: PlacementLimits, home: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Lengths, m, that are zero or more where the limits hold at places (electrodes, 2) of electrodes from ``home``."""
-    near = np.triu_indices(len(places), 1)
+def _constraints(skin: Skin, limits: PlacementLimits, initial: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Slacks of the limits, m: zero or more where they hold; ``places``: of the electrodes, moved from ``initial``."""
+    i, j = np.triu_indices(len(places), 1)
     inside = np.where(skin.domain.contains(places), 1.0, -1.0) * skin.domain.boundary_distance(places)
-    parts = [np.linalg.norm(places[near[0]] - places[near[1]], axis=1) - limits.distance]
+    parts = [np.linalg.norm(places[i] - places[j], axis=1) - limits.distance]
     parts += [inside - (limits.margin or 0.0)]
     parts += [np.linalg.norm(places - circle[:2], axis=1) - circle[2] for circle in limits.keep_out]
     if np.isfinite(limits.farthest):
-        parts.append(limits.farthest - np.linalg.norm(places - home, axis=1))
+        parts.append(limits.farthest - np.linalg.norm(places - initial, axis=1))
     return np.concatenate(parts)
 
 
@@ -255,21 +255,21 @@ def _value(objective: _Objective) -> float:
     return float(objective(jnp.zeros((objective.model.electrodes, 2), objective.model.dtype))[0])
 
 
-def _mirror(skin: Skin, places: np.ndarray) -> np.ndarray:
+def _symmetry_projection(skin: Skin, places: np.ndarray) -> np.ndarray:
     """The projection of shifts, (2 electrodes, 2 electrodes), to those that keep the mirror symmetries of the places.
 
     The mirrors are those across the middle of the sheet along x and y that map electrodes to electrodes.
     """
     low, high = np.asarray(skin.domain.bounds)
     middle, size = 0.5 * (low + high), float(np.max(high - low))
-    kept = np.eye(2 * len(places))
+    result = np.eye(2 * len(places))
     for axis in range(2):
         sign = np.where(np.arange(2) == axis, -1.0, 1.0)
-        away = np.linalg.norm((middle + sign * (places - middle))[:, None] - places, axis=2)
-        partner = away.argmin(1)
-        if (away.min(1) < MIRRORED * size).all() and len(set(partner.tolist())) == len(places):
-            image = np.zeros_like(kept)
+        distance = np.linalg.norm((middle + sign * (places - middle))[:, None] - places, axis=2)
+        partner = distance.argmin(1)
+        if (distance.min(1) < MIRROR_TOLERANCE * size).all() and len(set(partner.tolist())) == len(places):
+            image = np.zeros_like(result)
             for k, other in enumerate(partner):
                 image[2 * other : 2 * other + 2, 2 * k : 2 * k + 2] = np.diag(sign)
-            kept = 0.5 * (kept + image @ kept)
-    return np.asarray(kept)
+            result = 0.5 * (result + image @ result)
+    return np.asarray(result)

@@ -109,7 +109,7 @@ def choose_readings(
         ProtocolError: if the scan has fewer readings, or (for `Volume`) K has a lower rank.
     """
     signal, selection = real_array("signal", signal, ProtocolError), selection or DOptimal()
-    readings = _readings_of(signal)
+    readings = _reading_count(signal)
     give = "an object, such as selection=jaxeit.scan.DOptimal()"
     require_kind(selection, AbstractSelection, ProtocolError, "a selection", give, "choose_readings")
     if not is_number(count) or not 0 < count <= readings:
@@ -117,15 +117,15 @@ def choose_readings(
     if pattern is None and (is_traced(switch) or switch):
         raise ProtocolError("switch is given without the pattern that names the driven pairs; give pattern=")
     drive = np.zeros(readings, int) if pattern is None else drives(pattern)
-    chosen = _chosen(selection, signal, jnp.asarray(drive), jnp.asarray(switch, signal.dtype), count)
-    if isinstance(selection, Volume) and _spans_less(chosen):
+    chosen = _greedy_selection(selection, signal, jnp.asarray(drive), jnp.asarray(switch, signal.dtype), count)
+    if isinstance(selection, Volume) and _is_rank_deficient(chosen):
         raise ProtocolError(
             f"the readings span fewer than {count} dimensions; ask for fewer readings, or choose by DOptimal"
         )
     return chosen
 
 
-def _readings_of(signal: Float[Array, "readings readings"]) -> int:
+def _reading_count(signal: Float[Array, "readings readings"]) -> int:
     """The number of readings of K, which is refused unless it is square and, where it can be seen, finite."""
     if signal.ndim != 2 or signal.shape[0] != signal.shape[1]:
         raise ProtocolError(f"signal has shape {signal.shape}; give (readings, readings), from signal_covariance")
@@ -134,7 +134,7 @@ def _readings_of(signal: Float[Array, "readings readings"]) -> int:
     return signal.shape[0]
 
 
-def _spans_less(chosen: Chosen) -> bool:
+def _is_rank_deficient(chosen: Chosen) -> bool:
     """Whether the gain of the last reading is only rounding error; False for traced gains."""
     known = not is_traced(chosen.gain)
     return known and float(chosen.gain[-1]) <= ROUNDING_FRACTION * float(jnp.max(chosen.gain))
@@ -147,7 +147,7 @@ def drives(pattern: Integer[ArrayLike, "readings 4"]) -> Int[np.ndarray, " readi
 
 
 @verb
-def _chosen(
+def _greedy_selection(
     selection: AbstractSelection,
     signal: Float[Array, "readings readings"],
     drive: Int[Array, " readings"],
@@ -170,9 +170,9 @@ def _chosen(
         driven = jnp.zeros(m, bool).at[drive].max(taken)[drive]
         row = jnp.argmax(jnp.where(taken, -1, gain / (1 + jnp.where(driven, zero, switch))))
         pivot = selection.pivot(left[row])
-        line = (signal[row] - factor[:, row] @ factor) * jnp.where(pivot > 0, pivot, jnp.inf) ** -0.5
-        factor = factor.at[k].set(line)
-        return left - line**2, factor, taken.at[row].set(True), rows.at[k].set(row), gains.at[k].set(gain[row])
+        factor_row = (signal[row] - factor[:, row] @ factor) * jnp.where(pivot > 0, pivot, jnp.inf) ** -0.5
+        factor = factor.at[k].set(factor_row)
+        return left - factor_row**2, factor, taken.at[row].set(True), rows.at[k].set(row), gains.at[k].set(gain[row])
 
     *_, rows, gains = jax.lax.fori_loop(0, count, take, start)
     return Chosen(rows, gains)
