@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..presses.pooled import PooledPresses, PressSeries, thinned
+from ..presses.pooled import PooledPresses, PressSeries, block_means
 
 POINTS = 96  # means per press: a smooth line in the report at a negligible size in the file
 FULL_FORCE = 0.9  # fraction of a pad's largest force: presses above it cover nearly the whole range
@@ -79,7 +79,7 @@ def typical_loops(presses: PooledPresses, gain: np.ndarray | None = None) -> Loo
     chosen = [_typical(np.flatnonzero(presses.owner == pad), data.force, data.pressure[:, pad]) for pad in range(pads)]
     out = np.full((2, pads, POINTS), np.nan)
     for pad, one in enumerate(chosen):
-        mine = thinned(PressSeries(*(column[series.press == one] for column in series)), POINTS)
+        mine = block_means(PressSeries(*(column[series.press == one] for column in series)), POINTS)
         count = len(mine.force)
         out[:, pad, :count] = (mine.pressure[:, pad], mine.force) if count else np.nan
     known = [np.nan if one < 0 else 1.0 if gain is None else gain[one, pad] for pad, one in enumerate(chosen)]

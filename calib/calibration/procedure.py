@@ -23,7 +23,7 @@ from ..fitting.response import (
     hold_out_response,
     require_every_pad_pressed,
 )
-from ..presses.contradictions import contradicted_presses, drifting_pads, moved_places
+from ..presses.contradictions import drifting_pads, outlying_presses, place_errors
 from ..presses.pooled import PooledPresses, pool_presses
 from ..presses.skins import differing_parts
 from ..presses.table import PressMeasurements, Processing, measure
@@ -206,9 +206,9 @@ def _contradictions(found: _Found) -> tuple[str, ...]:
     seen = None if guessed else seen  # places that tell nothing contradict nobody
     return (
         *filter(None, [guessed]),
-        *contradicted_presses(presses, held_out.sum(1), seen),
+        *outlying_presses(presses, held_out.sum(1), seen),
         *drifting_pads(presses, names, held_out, by_place=corrected),
-        *(moved_places(presses, seen) if seen is not None and isinstance(found.imager.locator, ContactLocator) else ()),
+        *(place_errors(presses, seen) if seen is not None and isinstance(found.imager.locator, ContactLocator) else ()),
     )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage, stats
 
-from .corrections import bridge
+from .corrections import interpolate_missing
 
 MIN_ARRAY_CHANNELS = 8  # with fewer channels, a user inspects each one by itself
 STUCK_FRACTION = 0.99  # of the samples at one value
@@ -84,7 +84,7 @@ def _saturated(values: np.ndarray, count: np.ndarray) -> np.ndarray:
 def _spiking(values: np.ndarray, idle: np.ndarray) -> np.ndarray:
     if idle.all():
         return np.zeros(len(idle), bool)
-    filled = np.apply_along_axis(bridge, 0, values[:, ~idle])
+    filled = np.apply_along_axis(interpolate_missing, 0, values[:, ~idle])
     jump = np.abs(filled - ndimage.median_filter(filled, (SPIKE_WINDOW, 1), mode="nearest"))
     typical = np.median(np.ptp(filled, 0))
     out = np.zeros(len(idle), bool)

@@ -62,7 +62,7 @@ def sample_rate(time: np.ndarray) -> float:
     return 1e9 / period
 
 
-def bridge(column: np.ndarray) -> np.ndarray:
+def interpolate_missing(column: np.ndarray) -> np.ndarray:
     """Interpolate missing samples of one channel and hold its ends. A channel of missing samples only is unchanged."""
     good = np.isfinite(column)
     if good.all() or not good.any():
@@ -117,7 +117,7 @@ class LowPass(AbstractCorrection):
             return values
         rate = sample_rate(time)
         sections = self.sections(rate, name)
-        filled = np.apply_along_axis(bridge, 0, values)
+        filled = np.apply_along_axis(interpolate_missing, 0, values)
         smooth = np.concatenate([self._filter(sections, filled[s]) for s in _continuous_runs(time, rate)])
         return np.where(np.isfinite(values), smooth, np.nan)
 
@@ -159,14 +159,14 @@ class AbstractBaseline(abc.ABC):
         """
         at, t0, t1 = centres
         w0, w1 = (w[:, None] for w in self.weights(at, t0, t1))
-        mean = held.mean - weighted(w0, before.mean) - weighted(w1, after.mean)
+        mean = held.mean - masked_product(w0, before.mean) - masked_product(w1, after.mean)
         variance = held.standard_error**2
-        variance = variance + weighted(w0, before.standard_error) ** 2
-        variance = variance + weighted(w1, after.standard_error) ** 2
+        variance = variance + masked_product(w0, before.standard_error) ** 2
+        variance = variance + masked_product(w1, after.standard_error) ** 2
         return WindowMeans(mean, np.sqrt(variance), held.count)
 
 
-def weighted(weight: np.ndarray, value: np.ndarray) -> np.ndarray:
+def masked_product(weight: np.ndarray, value: np.ndarray) -> np.ndarray:
     """weight * value, where a weight of zero gives zero even for NaN."""
     return np.where(weight == 0, 0.0, weight * value)
 
@@ -227,16 +227,16 @@ def _standard_error(residual: np.ndarray, good: np.ndarray, count: np.ndarray) -
     return np.asarray(np.sqrt(scatter) / count)
 
 
-def _whole_windows(values: np.ndarray, ranges: np.ndarray, blocks: int) -> tuple[np.ndarray, np.ndarray]:
+def _finite_window_means(values: np.ndarray, ranges: np.ndarray, blocks: int) -> tuple[np.ndarray, np.ndarray]:
     """Means and standard errors (windows, channels) of windows of finite samples, each cut into so many blocks."""
     rows = ranges[:, 1] - ranges[:, 0]
     ends = np.cumsum(rows)
     index = np.repeat(ranges[:, 1] - ends, rows) + np.arange(ends[-1])
     level = values[ranges[:, 0]]  # levels are large, noise is small; and a constant window has no error at all
-    away = values[index] - np.repeat(level, rows, axis=0)
+    deviation = values[index] - np.repeat(level, rows, axis=0)
     edges = np.arange(blocks + 1) * rows[:, None] // blocks
     first = (edges + (ends - rows)[:, None])[:, :-1]
-    sums = np.add.reduceat(away, first.ravel(), axis=0).reshape(*first.shape, -1)
+    sums = np.add.reduceat(deviation, first.ravel(), axis=0).reshape(*first.shape, -1)
     shift = sums.sum(axis=1) / rows[:, None]
     sums -= np.diff(edges)[:, :, None] * shift[:, None]
     scatter = np.einsum("wbc,wbc->wc", sums, sums) * (blocks / (blocks - 1) if blocks > 1 else np.nan)
@@ -247,12 +247,12 @@ def window_means(values: np.ndarray, ranges: np.ndarray) -> WindowMeans:
     """Means of `values` (n, channels) over half-open index `ranges` (windows, 2)."""
     shape, rows = (len(ranges), values.shape[1]), ranges[:, 1] - ranges[:, 0]
     mean, error, count = np.empty(shape), np.empty(shape), np.empty(shape, int)
-    lost = np.append(0, np.cumsum(~np.isfinite(values).all(axis=1)))
-    blocks = np.where(lost[ranges[:, 1]] == lost[ranges[:, 0]], np.minimum(rows, BLOCKS_PER_WINDOW), 0)
-    for number in np.unique(blocks[blocks > 0]):  # whole windows, the usual case, take a fraction of the time together
-        alike = blocks == number
-        mean[alike], error[alike] = _whole_windows(values, ranges[alike], int(number))
-        count[alike] = rows[alike, None]
+    missing = np.append(0, np.cumsum(~np.isfinite(values).all(axis=1)))
+    blocks = np.where(missing[ranges[:, 1]] == missing[ranges[:, 0]], np.minimum(rows, BLOCKS_PER_WINDOW), 0)
+    for number in np.unique(blocks[blocks > 0]):  # complete windows, the usual case, are fastest together
+        same = blocks == number
+        mean[same], error[same] = _finite_window_means(values, ranges[same], int(number))
+        count[same] = rows[same, None]
     for i in np.flatnonzero(blocks == 0):
         mean[i], error[i], count[i] = _window_mean(values[slice(*ranges[i])])
     return WindowMeans(mean, error, count)

@@ -2,7 +2,7 @@
 
 Channels read p = M u, with u the pads' own pressures and M the crosstalk matrix, whose diagonal is one. A press far
 from pad i leaves u_i = 0, so that p_i = sum_j M_ij u_j over the other pads: row i of M is a linear regression on such
-presses, wherever else they lie. Forces are not needed. A press near pad i loads pad i itself, and tells nothing of M.
+presses, wherever else they lie. Forces are not needed. A press near pad i loads pad i itself, and does not inform on M.
 """
 
 from collections.abc import Sequence
@@ -18,11 +18,11 @@ from jaxeit.linalg.lapack import solve
 
 from .streams import robust_deviation
 
-ROUNDS = 4  # of the regressions; each uses the pads' own pressures by the round before
-MIN_PLACES = 4  # places far from a pad, and twice the number of other pads; fewer determine no row of the matrix
-MAX_CROSSTALK = 0.5  # beyond it a channel is not that of its pad, which `check` tells
+ITERATIONS = 4  # of the regressions; each uses the pads' own pressures by the iteration before
+MIN_PLACES = 4  # far from a pad, and at least twice the number of other pads; fewer do not determine a row
+MAX_CROSSTALK = 0.5  # beyond it a channel is not that of its pad, which `check` reports
 SIGNIFICANCE = 4.0  # an element below so many of its standard errors counts as no crosstalk
-LARGE_LOAD = 2.0  # multiple of the median load; rows above it are scaled down to it
+MAX_LOAD_RATIO = 2.0  # largest load over the median load; rows above it are scaled down to it
 HUBER_WIDTH = 2.0  # standard deviations beyond which a press loses weight
 
 
@@ -83,13 +83,13 @@ def fit_crosstalk(
     """
     count = len(pads)
     found = Crosstalk.none(count)
-    sound = np.isfinite(pressure).all(1) & np.isfinite(position).all(1)
-    pressure, position = pressure[sound], position[sound]
+    finite = np.isfinite(pressure).all(1) & np.isfinite(position).all(1)
+    pressure, position = pressure[finite], position[finite]
     place = np.unique(np.round(position, 6), axis=0, return_inverse=True)[1].ravel()
-    away = [_distance(pad, position) for pad in pads]
-    for _ in range(ROUNDS if count > 1 else 0):
+    distance = [_distance(pad, position) for pad in pads]
+    for _ in range(ITERATIONS if count > 1 else 0):
         own = found.own(pressure)
-        rows = [_row(i, pressure[:, i], own, away[i], place) for i in range(count)]
+        rows = [_matrix_row(i, pressure[:, i], own, distance[i], place) for i in range(count)]
         found = Crosstalk(*map(np.stack, zip(*rows, strict=True)))
         if found.largest > MAX_CROSSTALK:
             return Crosstalk.none(count)
@@ -102,45 +102,46 @@ def _distance(pad: je.Pad, position: np.ndarray) -> np.ndarray:
     return np.where(outline.contains(position), 0.0, outline.boundary_distance(position))
 
 
-def _row(
-    pad: int, reading: np.ndarray, own: np.ndarray, away: np.ndarray, place: np.ndarray
+def _matrix_row(
+    pad: int, reading: np.ndarray, own: np.ndarray, distance: np.ndarray, place: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Row of a pad in the matrix, and its standard errors; without crosstalk if the presses do not determine it."""
     count = own.shape[1]
     others = np.arange(count) != pad
     row, error = np.eye(count)[pad], np.full(count, np.nan)
-    outside = away > 0
-    far = outside & (away >= np.median(away[outside])) if outside.any() else outside
+    outside = distance > 0
+    far = outside & (distance >= np.median(distance[outside])) if outside.any() else outside
     if len(np.unique(place[far])) < max(MIN_PLACES, 2 * (count - 1)):
         return row, error
-    coefficients, error[others] = _robust_line(own[far][:, others], reading[far], place[far])
+    coefficients, error[others] = _huber_regression(own[far][:, others], reading[far], place[far])
     row[others] = np.where(np.abs(coefficients) > SIGNIFICANCE * error[others], coefficients, 0.0)
     return row, error
 
 
-def _robust_line(x: np.ndarray, y: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _huber_regression(x: np.ndarray, y: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients (k,) of y = x @ c with Huber's weights, and their standard errors.
 
-    Rows of loads far above the others are scaled down, because one wrong press of great load would draw the line to
-    itself. The errors are those of independent rows or of the sandwich over places, whichever are larger: the latter
+    Rows of loads far above the others are scaled down, because a single wrong press of large load would have too much
+    leverage. The errors are those of independent rows or of the sandwich over places, whichever are larger: the latter
     alone are uncertain for few places.
     """
     load = np.abs(x).sum(1)
-    most = LARGE_LOAD * np.median(load)
-    least = np.where(load > most, most / np.where(load > most, load, 1), 1)[:, None]
-    x, y = x * least, y * least[:, 0]
+    limit = MAX_LOAD_RATIO * np.median(load)
+    scale = np.where(load > limit, limit / np.where(load > limit, load, 1), 1)[:, None]
+    x, y = x * scale, y * scale[:, 0]
     weight = np.ones(len(y))
     for _ in range(10):
         root = np.sqrt(weight)[:, None]
         coefficients = np.linalg.lstsq(x * root, y * root[:, 0], rcond=None)[0]
-        left = y - x @ coefficients
-        size = robust_deviation(left)
-        far = np.abs(left) > HUBER_WIDTH * size
-        weight = np.where(far & (size > 0), HUBER_WIDTH * size / np.where(far, np.abs(left), 1), 1)
-    scores = np.stack([np.bincount(place, column) for column in (x * (weight * left)[:, None]).T], 1)
+        residual = y - x @ coefficients
+        deviation = robust_deviation(residual)
+        outside = np.abs(residual) > HUBER_WIDTH * deviation
+        huber = HUBER_WIDTH * deviation / np.where(outside, np.abs(residual), 1)
+        weight = np.where(outside & (deviation > 0), huber, 1)
+    scores = np.stack([np.bincount(place, column) for column in (x * (weight * residual)[:, None]).T], 1)
     gram = x.T @ (x * weight[:, None])
-    groups = len(np.unique(place))
-    spare = groups / max(groups - x.shape[1], 1)
+    clusters = len(np.unique(place))
+    correction = clusters / max(clusters - x.shape[1], 1)
     sandwich = (np.linalg.lstsq(gram, scores.T, rcond=None)[0] ** 2).sum(1)
-    independent = np.diagonal(np.linalg.pinv(x.T @ x)) * np.mean((weight * left) ** 2) / np.mean(weight >= 1) ** 2
-    return coefficients, np.sqrt(spare * np.maximum(sandwich, independent))
+    independent = np.diagonal(np.linalg.pinv(x.T @ x)) * np.mean((weight * residual) ** 2) / np.mean(weight >= 1) ** 2
+    return coefficients, np.sqrt(correction * np.maximum(sandwich, independent))

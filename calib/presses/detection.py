@@ -113,7 +113,7 @@ def _rejection_reason(
     return ""
 
 
-def _condition(time: np.ndarray, force: np.ndarray, limits: DetectionLimits) -> tuple[np.ndarray, float, float]:
+def _preprocess(time: np.ndarray, force: np.ndarray, limits: DetectionLimits) -> tuple[np.ndarray, float, float]:
     """Force without gaps, spikes and rest level (N), its noise (N) and its sample rate (Hz)."""
     rate = sample_rate(time)
     good = np.isfinite(force)
@@ -161,13 +161,13 @@ def find_presses(
         raise PressError(f"time does not increase at sample {back[0]}: sort the samples and drop equal times.")
     if np.isfinite(force).sum() < MIN_SAMPLES:
         raise PressError(f"{np.isfinite(force).sum()} finite force samples; presses are found in {MIN_SAMPLES} or more")
-    signal, noise, rate = _condition(time, force, limits)
+    signal, noise, rate = _preprocess(time, force, limits)
     high = _default_threshold(signal, noise) if threshold is None else threshold
     runs = _hysteresis(signal, high / 2, high)
-    return _press_times([_describe(time, force, signal, (a, b), noise, rate, limits) for a, b in runs.tolist()])
+    return _press_times([_measure_press(time, force, signal, (a, b), noise, rate, limits) for a, b in runs.tolist()])
 
 
-def _describe(
+def _measure_press(
     time: np.ndarray,
     force: np.ndarray,
     signal: np.ndarray,

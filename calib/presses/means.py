@@ -50,8 +50,8 @@ def read_press(
     return time, correct(corrections, time, stream.read(a, b), stream.name)
 
 
-def _read_together(spans: np.ndarray, rows: int) -> Iterator[slice]:
-    """Presses of these index ranges (presses, 2), those together that follow each other within so many rows."""
+def _read_blocks(spans: np.ndarray, rows: int) -> Iterator[slice]:
+    """Slices of presses of these index ranges (presses, 2), each slice within so many rows of the stream."""
     first = 0
     for i in range(1, len(spans) + 1):
         if i == len(spans) or spans[i, 0] < spans[first, 0] or spans[i, 1] - spans[first, 0] > rows:
@@ -59,7 +59,7 @@ def _read_together(spans: np.ndarray, rows: int) -> Iterator[slice]:
             first = i
 
 
-def _averaged_windows(
+def _press_window_means(
     stream: ReadableStream, windows: PressWindows, corrections: Sequence[AbstractCorrection]
 ) -> Iterator[WindowMeans]:
     """Means over the three averaged windows of each press, in the order of `AVERAGED_WINDOWS`, in parts of presses."""
@@ -67,7 +67,7 @@ def _averaged_windows(
     ranges = index_ranges(time, np.stack([getattr(windows, name) for name in AVERAGED_WINDOWS], 1))
     # A filter sees each press alone, so that no press changes the means of another one.
     rows = 0 if corrections else READ_AHEAD_BYTES // (8 * max(stream.channels, 1))
-    for presses in _read_together(spans, rows):
+    for presses in _read_blocks(spans, rows):
         a, b = int(spans[presses, 0].min()), int(spans[presses, 1].max())
         values = correct(corrections, time[a:b], stream.read(a, b), stream.name)
         yield window_means(values, np.clip(ranges[presses].reshape(-1, 2) - a, 0, b - a))
@@ -88,14 +88,14 @@ def press_means(
     Returns: rows for all presses; NaN where a channel has no finite sample in a window that the baseline uses.
     """
     rule = TwoSided() if baseline is None else baseline
-    parts = list(_averaged_windows(stream, windows, corrections))
-    held, before, after = (_nth_window(parts, k, stream.channels) for k in range(3))
+    parts = list(_press_window_means(stream, windows, corrections))
+    hold, before, after = (_select_window(parts, k, stream.channels) for k in range(3))
     centres = tuple(windows.centre(name) for name in AVERAGED_WINDOWS)
-    change = rule.remove(held, before, after, centres)
-    return PressMeans(change, held.mean - change.mean, before.mean)
+    change = rule.remove(hold, before, after, centres)
+    return PressMeans(change, hold.mean - change.mean, before.mean)
 
 
-def _nth_window(parts: list[WindowMeans], k: int, width: int) -> WindowMeans:
+def _select_window(parts: list[WindowMeans], k: int, width: int) -> WindowMeans:
     """The k-th window of every press."""
     columns = ([getattr(part, f.name)[k :: len(AVERAGED_WINDOWS)] for part in parts] for f in fields(WindowMeans))
     return WindowMeans(*(np.concatenate([np.empty((0, width)), *column]) for column in columns))

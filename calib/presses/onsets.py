@@ -13,8 +13,8 @@ from .times import PressColumns
 from .windows import PressWindows
 
 RISE_FRACTIONS = (0.2, 0.5, 0.8)  # of the way from rest to hold: far from noise at either end
-HALF = RISE_FRACTIONS.index(0.5)
-ROUNDS = 4  # in which the windows of a stream move by the delay found
+HALF_INDEX = RISE_FRACTIONS.index(0.5)
+ITERATIONS = 4  # of the shift of a stream's windows by its delay
 MIN_STEP = 10_000_000  # ns; a smaller change of the delay moves no window
 MIN_COMPARED = 3  # presses at the beginning and at the end, whose delays are compared
 CHANGE_SPREADS = 3.0  # of the delays within these presses: a smaller change is scatter
@@ -34,8 +34,8 @@ class OnsetDelay:
     | change  | growth of the delay from the first quarter of the presses to the last one; 0 if     | s    |
     |         | their scatter explains it                                                           |      |
 
-    A clock moves the whole rise alike. A curved response, friction and creep move its parts differently, and the start
-    of the rise hardly at all, so that `shift` is what a clock alone may explain.
+    A clock shifts all parts of the rise equally. A curved response, friction and creep move its parts differently, and
+    the start of the rise hardly at all, so that `shift` is what a clock alone may explain.
     """
 
     delay: float
@@ -63,7 +63,7 @@ def _rise_times(stream: ReadableStream, windows: PressWindows, i: int) -> list[f
     if not all(map(len, ends)):
         return [float("nan")] * len(RISE_FRACTIONS)
     rests, holds = (part.mean(0) for part in ends)
-    # Along the change that the press makes: a norm would fold where a stream is early and its rest is none.
+    # Projection on the change by the press: a norm would fold where a stream is early and its rest is zero.
     signal = values @ (holds - rests)
     rest, hold = rests @ (holds - rests), holds @ (holds - rests)
     stop = np.searchsorted(time, windows.hold[i, 0])
@@ -82,20 +82,20 @@ def onset_delays(
     The delay checks clocks and is no clock itself: a curved response shifts the crossing too (a stream that follows
     force**0.7 reaches half its value sooner), which `OnsetDelay.shift` leaves out as far as it can be told.
     """
-    reference = _rises(force, presses, windows)
+    reference = _force_rise_times(force, presses, windows)
     origin = reference - windows.centre("ramp")[np.flatnonzero(presses.accepted), None]
-    seen = windows.moved(_middle(origin))
-    return {s.name: _onset_delay(_delays(s, presses, seen, reference)) for s in others}
+    shifted = windows.shifted(_median_delay(origin))
+    return {s.name: _onset_delay(_delays(s, presses, shifted, reference)) for s in others}
 
 
 def ramp_delay(force: ReadableStream, presses: PressColumns, windows: PressWindows) -> OnsetDelay:
     """Delay of the force after even ramps between the times that the list of presses states."""
     ramp = windows.ramp[np.flatnonzero(presses.accepted)]
     stated = ramp[:, :1] + np.diff(ramp, axis=1) * np.array(RISE_FRACTIONS)
-    return _onset_delay(_rises(force, presses, windows) - stated)
+    return _onset_delay(_force_rise_times(force, presses, windows) - stated)
 
 
-def _rises(force: ReadableStream, presses: PressColumns, windows: PressWindows) -> np.ndarray:
+def _force_rise_times(force: ReadableStream, presses: PressColumns, windows: PressWindows) -> np.ndarray:
     """Times (accepted presses, fractions) ns of the rises of the force."""
     middle = windows.centre("ramp")[np.flatnonzero(presses.accepted), None]
     return np.asarray(_delays(force, presses, windows, middle) + middle)
@@ -109,41 +109,40 @@ def _delays(stream: ReadableStream, presses: PressColumns, windows: PressWindows
     """
     rows = np.flatnonzero(presses.accepted)
 
-    def against(step: int) -> np.ndarray:
-        seen = windows.moved(step)
-        return np.asarray(
-            np.array([_rise_times(stream, seen, int(i)) for i in rows]).reshape(-1, len(RISE_FRACTIONS)) - origin
-        )
+    def delays_at(step: int) -> np.ndarray:
+        shifted = windows.shifted(step)
+        times = np.array([_rise_times(stream, shifted, int(i)) for i in rows]).reshape(-1, len(RISE_FRACTIONS))
+        return np.asarray(times - origin)
 
-    delays = against(0)
-    if np.isnan(delays[:, HALF]).mean() > 0.5:  # it rises later than the ramp ends, or not at all
-        later = against(round(float(np.median(np.diff(windows.ramp[rows], axis=1)))))
-        delays = delays if np.isnan(later[:, HALF]).mean() > 0.5 else later
+    delays = delays_at(0)
+    if np.isnan(delays[:, HALF_INDEX]).mean() > 0.5:  # it rises later than the ramp ends, or not at all
+        later = delays_at(round(float(np.median(np.diff(windows.ramp[rows], axis=1)))))
+        delays = delays if np.isnan(later[:, HALF_INDEX]).mean() > 0.5 else later
     last = 0
-    for _ in range(ROUNDS):
-        step = _middle(delays)
+    for _ in range(ITERATIONS):
+        step = _median_delay(delays)
         if abs(step - last) < MIN_STEP:
             break
-        delays, last = against(step), step
+        delays, last = delays_at(step), step
     return delays
 
 
-def _middle(delays: np.ndarray) -> int:
+def _median_delay(delays: np.ndarray) -> int:
     """Median delay at half of the hold value, ns; 0 without any."""
-    half = delays[:, HALF]
+    half = delays[:, HALF_INDEX]
     return round(float(np.nanmedian(half))) if np.isfinite(half).any() else 0
 
 
 def _onset_delay(delays: np.ndarray) -> OnsetDelay:
     """Summary of delays (presses, fractions) in ns."""
-    good = delays[np.isfinite(delays[:, HALF])] / SECOND
+    good = delays[np.isfinite(delays[:, HALF_INDEX])] / SECOND
     if not len(good):
         return OnsetDelay(float("nan"), float("nan"), 0, float("nan"), 0.0)
-    middle = float(np.median(good[:, HALF]))
-    sign = np.sign(good[:, HALF])
+    half = good[:, HALF_INDEX]
+    sign = np.sign(half)
     one_sign = ((np.sign(good) == sign[:, None]) | np.isnan(good)).all(axis=1)
     shift = np.where(one_sign, sign * np.nanmin(np.abs(good), axis=1), 0.0)
-    return OnsetDelay(middle, _spread(good[:, HALF]), len(good), float(np.median(shift)), _change(good[:, HALF]))
+    return OnsetDelay(float(np.median(half)), _spread(half), len(good), float(np.median(shift)), _change(half))
 
 
 def _spread(values: np.ndarray) -> float:

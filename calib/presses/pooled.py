@@ -94,17 +94,17 @@ class PressData:
 
     def pad_samples(self, *, with_history: bool) -> PadSamples:
         """Samples of each pad; all samples ``with_history``, for a curve that depends on earlier pressures."""
-        everything = np.broadcast_to(np.arange(len(self.sample_force)), self.mask.shape)
-        rows = everything if with_history else self._own
+        all_rows = np.broadcast_to(np.arange(len(self.sample_force)), self.mask.shape)
+        rows = all_rows if with_history else self._fit_rows
         pressure, mask = (np.take_along_axis(a, rows, 1) for a in (self.sample_pressure, self.mask))
         return PadSamples(rows, pressure, self.sample_force[rows], mask, self.sample_place[rows])
 
     @cached_property
-    def _own(self) -> np.ndarray:
+    def _fit_rows(self) -> np.ndarray:
         """Rows (pads, m) of each pad's samples in `mask`, of missing samples, and of padding, in order of time."""
-        wanted = self.mask | ~(np.isfinite(self.sample_pressure) & np.isfinite(self.sample_force))
-        most = wanted.sum(1).max(initial=0)
-        return np.argsort(~wanted, axis=1, kind="stable")[:, :most]
+        relevant = self.mask | ~(np.isfinite(self.sample_pressure) & np.isfinite(self.sample_force))
+        most = relevant.sum(1).max(initial=0)
+        return np.argsort(~relevant, axis=1, kind="stable")[:, :most]
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,7 @@ class PooledPresses:
 
     def quiet_frames(self, processing: Processing) -> np.ndarray:
         """Frames (n, readings) V before the presses, minus the mean of each rest; the noise is estimated from them."""
-        return np.concatenate([np.concatenate(_rests(one, "eit", processing)) for one in self.recordings])
+        return np.concatenate([np.concatenate(_rest_residuals(one, "eit", processing)) for one in self.recordings])
 
     @property
     def sensor_noise(self) -> np.ndarray:
@@ -153,11 +153,11 @@ class PooledPresses:
         Of readings as a live view takes them, without the low-pass by which recordings are corrected. A pad that
         recovers from a press moves during the rest after it, which makes the deviation of that rest larger.
         """
-        rests = [rest for one in self.recordings for rest in _rests(one, "pressure") if len(rest)]
+        rests = [rest for one in self.recordings for rest in _rest_residuals(one, "pressure") if len(rest)]
         if not rests:
             return np.zeros(self.data.pressure.shape[1])
-        each = np.array([np.sqrt(finite_mean(rest**2)) for rest in rests])
-        return np.asarray(np.nanmedian(np.where(np.isfinite(each).any(0), each, 0.0), 0))
+        deviations = np.array([np.sqrt(finite_mean(rest**2)) for rest in rests])
+        return np.asarray(np.nanmedian(np.where(np.isfinite(deviations).any(0), deviations, 0.0), 0))
 
 
 def pool_presses(sessions: Sequence[Session], skin: je.Skin, processing: Processing | None = None) -> PooledPresses:
@@ -173,7 +173,7 @@ def pool_presses(sessions: Sequence[Session], skin: je.Skin, processing: Process
     pressure = crosstalk.own(pressure)
     owner = dominant_pad(pressure)
     series = PressSeries(
-        _press_of_samples(recordings),
+        _sample_presses(recordings),
         crosstalk.own(np.concatenate([m.samples.pressure for m in recordings])),
         np.concatenate([m.samples.force for m in recordings]),
     )
@@ -181,7 +181,7 @@ def pool_presses(sessions: Sequence[Session], skin: je.Skin, processing: Process
     return PooledPresses(
         recordings=recordings,
         series=series,
-        data=_press_data(recordings, position, pressure, thinned(series, MEANS_PER_PRESS)),
+        data=_press_data(recordings, position, pressure, block_means(series, MEANS_PER_PRESS)),
         dv=np.concatenate([m.dv for m in recordings]),
         position=position,
         owner=owner,
@@ -216,7 +216,7 @@ def _press_data(
     return replace(data, mask=data.mask & (data.share[means.press] >= MIN_SHARE).T)
 
 
-def _press_of_samples(recordings: Sequence[PressMeasurements]) -> np.ndarray:
+def _sample_presses(recordings: Sequence[PressMeasurements]) -> np.ndarray:
     """Row (n,) of the press of each sample, among all accepted presses."""
     rows, first = [], 0
     for m in recordings:
@@ -226,7 +226,7 @@ def _press_of_samples(recordings: Sequence[PressMeasurements]) -> np.ndarray:
     return np.concatenate(rows)
 
 
-def thinned(series: PressSeries, most: int) -> PressSeries:
+def block_means(series: PressSeries, most: int) -> PressSeries:
     """Replace the samples of each press by at most `most` means over equal parts of it, in order of time.
 
     A part with a missing sample has no mean (NaN).
@@ -244,7 +244,7 @@ def thinned(series: PressSeries, most: int) -> PressSeries:
     )
 
 
-def _rests(recording: PressMeasurements, name: str, processing: Processing | None = None) -> list[np.ndarray]:
+def _rest_residuals(recording: PressMeasurements, name: str, processing: Processing | None = None) -> list[np.ndarray]:
     """Samples of a stream in the rests before the accepted presses, minus the mean of each rest.
 
     Subtracting the mean of n samples removes one degree of freedom; the factor sqrt(n / (n - 1)) restores the variance.

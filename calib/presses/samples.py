@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .corrections import AbstractBaseline, AbstractCorrection, TwoSided, weighted
+from .corrections import AbstractBaseline, AbstractCorrection, TwoSided, masked_product
 from .means import read_press
 from .streams import ReadableStream, ReadAhead, finite_mean, index_ranges, resample
 from .times import PressColumns
@@ -44,10 +44,10 @@ def remove_baseline(
     rests = np.stack([windows.rest_before[i], windows.rest_after[i]])
     before, after = (finite_mean(values[a:b]) for a, b in index_ranges(time, rests))
     w0, w1 = rule.weights(time.astype(float), *rests.astype(float).mean(axis=1))
-    return time, values - (weighted(w0[:, None], before) + weighted(w1[:, None], after))
+    return time, values - (masked_product(w0[:, None], before) + masked_product(w1[:, None], after))
 
 
-def _one_press(
+def _press_rows(
     force: ReadableStream,
     pressure: ReadableStream,
     windows: PressWindows,
@@ -79,7 +79,7 @@ def press_samples(
     rule = TwoSided() if baseline is None else baseline
     force_ahead, pressure_ahead = ReadAhead(force), ReadAhead(pressure)
     accepted = np.flatnonzero(presses.accepted)
-    rows = [_one_press(force_ahead, pressure_ahead, windows, int(i), rule, corrections) for i in accepted]
+    rows = [_press_rows(force_ahead, pressure_ahead, windows, int(i), rule, corrections) for i in accepted]
     if not rows:
         empty = np.empty(0, int)
         return PressSamples(empty, np.empty((0, pressure.channels)), np.empty(0), empty, empty)

@@ -133,15 +133,15 @@ def measure(
     processing = processing or Processing()
     streams = {name: session.stream(name) for name in ("eit", "pressure", "force")}
     require_skin(session, skin, streams)
-    presses = _presses(session, streams["force"], place_needed)
+    presses = _press_table(session, streams["force"], place_needed)
     windows = press_windows(presses, processing.windows, recording_end(streams.values()))
     presses = reject_without_samples(presses, windows, streams.values(), processing.baseline)
-    held = _held(streams, windows, processing)
-    means = {name: found.change.mean for name, found in held.items()}
+    stream_means = _hold_means(streams, windows, processing)
+    means = {name: result.change.mean for name, result in stream_means.items()}
     channels, lost = _finite_channels(means["eit"], presses.accepted)
     _require_pads(session, skin, means["pressure"][presses.accepted])
     force = means["force"][:, 0]
-    presses = _with_force(session, _on_pads(presses, skin), force, means["pressure"])
+    presses = _reject_without_force(session, _reject_off_pads(presses, skin), force, means["pressure"])
     kept = presses.accepted
     return PressMeasurements(
         session=session,
@@ -149,14 +149,14 @@ def measure(
         dv=means["eit"][kept],
         pressure=means["pressure"][kept],
         force=force[kept],
-        untouched=held["eit"].baseline[kept].mean(0),
-        rest=held["pressure"].baseline[kept],
-        noise=_frame_noise(held["eit"].change, kept),
+        untouched=stream_means["eit"].baseline[kept].mean(0),
+        rest=stream_means["pressure"].baseline[kept],
+        noise=_frame_noise(stream_means["eit"].change, kept),
         channels=channels,
         samples=_samples(streams, presses, windows, processing),
         presses=presses,
         windows=windows,
-        notes=(*processing.notes(streams.values()), *lost, *_set_aside(presses)),
+        notes=(*processing.notes(streams.values()), *lost, *_rejection_notes(presses)),
     )
 
 
@@ -185,7 +185,7 @@ def require_skin(session: Session, skin: je.Skin, streams: dict[str, Stream]) ->
         )
 
 
-def _presses(session: Session, force: Stream, place_needed: bool) -> PressTable:
+def _press_table(session: Session, force: Stream, place_needed: bool) -> PressTable:
     if session.presses is not None and len(session.presses):
         return session.presses
     if "stage" not in session.streams and place_needed:
@@ -244,22 +244,22 @@ def _require_pads(session: Session, skin: je.Skin, pressure: np.ndarray) -> None
         )
 
 
-def _held(streams: dict[str, Stream], windows: PressWindows, processing: Processing) -> dict[str, PressMeans]:
-    """What each stream holds during the presses, corrected."""
+def _hold_means(streams: dict[str, Stream], windows: PressWindows, processing: Processing) -> dict[str, PressMeans]:
+    """Means of each stream over the holds of the presses, corrected."""
     return {
         name: press_means(stream, windows, baseline=processing.baseline, corrections=processing.of(stream))
         for name, stream in streams.items()
     }
 
 
-def _on_pads(presses: PressTable, skin: je.Skin) -> PressTable:
-    """The presses, without those beside all pads, whose force no pad tells."""
+def _reject_off_pads(presses: PressTable, skin: je.Skin) -> PressTable:
+    """Reject presses beside all pads, whose force no pad measures."""
     on_pads = rests_on_pads(skin, np.stack([presses.x, presses.y], 1), presses.tip_diameter)
     return reject(presses, ["" if on else "it rests on no pad" for on in on_pads])
 
 
-def _with_force(session: Session, presses: PressTable, force: np.ndarray, pressure: np.ndarray) -> PressTable:
-    """The presses, without those that miss force (presses,) or pressure; raises SessionError if none is left."""
+def _reject_without_force(session: Session, presses: PressTable, force: np.ndarray, pressure: np.ndarray) -> PressTable:
+    """Reject presses without force (presses,) or pressure; raises SessionError if none is left."""
     finite = np.isfinite(force) & np.isfinite(pressure).all(1)
     reasons = [
         "" if ok and f > 0 else ("no force" if ok else "force or pressure missing in the hold")
@@ -267,7 +267,7 @@ def _with_force(session: Session, presses: PressTable, force: np.ndarray, pressu
     ]
     presses = reject(presses, reasons)
     if not presses.accepted.any():
-        raise _error(session, "/presses", _why_none(presses), "see jaxeit check")
+        raise _error(session, "/presses", _rejection_summary(presses), "see jaxeit check")
     return presses
 
 
@@ -279,14 +279,14 @@ def _samples(
     return press_samples(force, pressure, presses, windows, baseline=processing.baseline, corrections=corrections)
 
 
-def _why_none(presses: PressTable) -> str:
+def _rejection_summary(presses: PressTable) -> str:
     if not len(presses):
         return "no press is listed or found in the force"
     reasons = sorted({r for r in presses.reason if r})
     return f"none of {len(presses)} presses can be used" + (f": {reasons[0]}" if reasons else "")
 
 
-def _set_aside(presses: PressTable) -> list[str]:
+def _rejection_notes(presses: PressTable) -> list[str]:
     bad = np.flatnonzero(~presses.accepted)
     if not len(bad):
         return []

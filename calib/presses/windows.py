@@ -31,7 +31,7 @@ class PressWindows:
         """Windows of some of the presses."""
         return PressWindows(*(getattr(self, field.name)[index] for field in fields(self)))
 
-    def moved(self, step: int) -> "PressWindows":
+    def shifted(self, step: int) -> "PressWindows":
         """All windows later by ``step``, ns."""
         return PressWindows(*(getattr(self, field.name) + step for field in fields(self)))
 
@@ -66,8 +66,8 @@ def press_windows(presses: PressColumns, lengths: WindowLengths | None = None, e
 
     A rest window never reaches into a neighbouring press, nor beyond `end` (ns), where the recording stops.
     """
-    c = WindowLengths() if lengths is None else lengths
-    guard = _ns(c.guard)
+    lengths = WindowLengths() if lengths is None else lengths
+    guard = _ns(lengths.guard)
     press, hold0, hold1, release = (
         np.asarray(t, np.int64) for t in (presses.t_press, presses.t_hold0, presses.t_hold1, presses.t_release)
     )
@@ -75,14 +75,14 @@ def press_windows(presses: PressColumns, lengths: WindowLengths | None = None, e
     last = np.iinfo(np.int64).max // 2 if end is None else end + guard
     following = np.concatenate([press[1:], [last]])
     before = press - guard
-    after = np.minimum(release + _ns(c.recovery), following - guard)
-    held = np.maximum(hold1 - guard, hold0)
+    after = np.minimum(release + _ns(lengths.recovery), following - guard)
+    hold_end = np.maximum(hold1 - guard, hold0)
     return PressWindows(
-        rest_before=np.stack([np.clip(before - _ns(c.rest), previous, before), before], 1),
+        rest_before=np.stack([np.clip(before - _ns(lengths.rest), previous, before), before], 1),
         ramp=np.stack([press, hold0], 1),
-        hold=np.stack([np.maximum(held - _ns(c.hold), hold0), held], 1),
+        hold=np.stack([np.maximum(hold_end - _ns(lengths.hold), hold0), hold_end], 1),
         release=np.stack([hold1, release], 1),
-        rest_after=np.stack([np.clip(after - _ns(c.rest), np.minimum(release, after), after), after], 1),
+        rest_after=np.stack([np.clip(after - _ns(lengths.rest), np.minimum(release, after), after), after], 1),
     )
 
 

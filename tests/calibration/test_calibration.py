@@ -30,7 +30,7 @@ from calib.fitting.curves import CURVES
 from calib.fitting.curves.play_operators import play, remembered
 from calib.fitting.fields import Places, geometry_of
 from calib.fitting.pads import LocatedPresses, fit_pads
-from calib.presses.contradictions import contradicted_presses, drifting_pads, moved_places
+from calib.presses.contradictions import drifting_pads, outlying_presses, place_errors
 from calib.presses.pooled import pool_presses
 from calib.presses.table import PressMeasurements, measure
 from calib.report import document as report
@@ -109,13 +109,13 @@ def test_contradicted_places_and_many_contradictions(skin, grid):
     with calib.open_session(grid) as session:
         pooled = pool_presses([session], skin)
     exact, near = pooled.data.force, pooled.position + 1e-3 * np.sin(np.arange(32.0)).reshape(16, 2)
-    assert contradicted_presses(pooled, exact, near) == ()
-    assert contradicted_presses(pooled, np.full(16, np.nan), np.full((16, 2), np.nan)) == ()
+    assert outlying_presses(pooled, exact, near) == ()
+    assert outlying_presses(pooled, np.full(16, np.nan), np.full((16, 2), np.nan)) == ()
     elsewhere = np.where(np.arange(16)[:, None] == 7, near[::-1], near)
-    (line,) = contradicted_presses(pooled, exact, elsewhere)
+    (line,) = outlying_presses(pooled, exact, elsewhere)
     assert f"the place of press 7: ({1e3 * pooled.position[7, 0]:.0f}, " in line
     others = exact * np.where(np.arange(16) % 4, 1.0, 2.0)  # a quarter of the presses: then the fit is to blame
-    assert contradicted_presses(pooled, others) == ()
+    assert outlying_presses(pooled, others) == ()
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +169,7 @@ def test_presses_without_places_tell_of_drifts_by_a_correction_only(sixty_four):
     part = told_forces(nowhere, np.exp(-0.7 * np.linspace(0, 1, 64)))
     assert drifting_pads(nowhere, ["a", "b", "c", "d"], part, by_place=True)
     assert drifting_pads(nowhere, ["a", "b", "c", "d"], part, by_place=False) == ()
-    assert moved_places(nowhere, sixty_four.position) == ()
+    assert place_errors(nowhere, sixty_four.position) == ()
 
 
 @pytest.mark.parametrize(
@@ -184,7 +184,7 @@ def test_presses_without_places_tell_of_drifts_by_a_correction_only(sixty_four):
 def test_places_that_lie_aside_as_a_whole_are_named(sixty_four, listed, said):
     seen = sixty_four.position + 1e-3 * np.random.default_rng(7).normal(size=(64, 2))
     seen[5], seen[40] = [0.03, 0.17], np.nan  # a press that slipped, and one without a contact
-    lines = moved_places(replace(sixty_four, position=listed(sixty_four.position)), seen)
+    lines = place_errors(replace(sixty_four, position=listed(sixty_four.position)), seen)
     assert len(lines) == (said is not None)
     assert all(re.search(said, line) for line in lines)
 

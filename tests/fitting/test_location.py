@@ -38,7 +38,7 @@ from calib.fitting.fields.unpressed_walls import unpressed_note
 from calib.fitting.losses import SoftL1
 from calib.fitting.pads import LocatedPresses, fit_pads
 from calib.fitting.results import FitResult
-from calib.presses.pooled import PressData, PressSeries, thinned
+from calib.presses.pooled import PressData, PressSeries, block_means
 
 from ..helpers import require_identical, spread_stacks
 
@@ -501,7 +501,7 @@ def test_the_simplest_within_one_standard_error_is_chosen_and_says_why(skin, geo
 def test_thinned_presses_keep_their_means_and_order():
     press = np.repeat([0, 1, 2], [10, 3, 1])
     force = np.arange(14.0)
-    rows, pressure, load = thinned(PressSeries(press, np.stack([force, 2 * force], 1), force), 5)
+    rows, pressure, load = block_means(PressSeries(press, np.stack([force, 2 * force], 1), force), 5)
     assert rows.tolist() == [0] * 5 + [1] * 3 + [2]
     np.testing.assert_allclose(load, [0.5, 2.5, 4.5, 6.5, 8.5, 10, 11, 12, 13])
     np.testing.assert_allclose(pressure[:, 1], 2 * load)
@@ -509,5 +509,5 @@ def test_thinned_presses_keep_their_means_and_order():
 
 def test_no_press_is_thinned_to_none():
     """As of a pad that no press rests on alone."""
-    none = thinned(PressSeries(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)), 5)
+    none = block_means(PressSeries(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)), 5)
     assert [part.shape for part in none] == [(0,), (0, 2), (0,)]

@@ -10,8 +10,8 @@ from calib.presses.corrections import (
     PreOnly,
     TwoSided,
     WindowMeans,
-    bridge,
     correct,
+    interpolate_missing,
     window_means,
 )
 from calib.presses.table import Processing
@@ -95,7 +95,7 @@ def test_corrections_fold_in_order_and_leave_the_input_alone():
 
 def test_bridge_interpolates_and_holds_the_ends():
     column = np.array([np.nan, 1.0, np.nan, np.nan, 4.0, np.nan])
-    np.testing.assert_allclose(bridge(column), [1, 1, 2, 3, 4, 4])
+    np.testing.assert_allclose(interpolate_missing(column), [1, 1, 2, 3, 4, 4])
 
 
 def test_baselines_are_exact_on_a_drift_and_on_a_constant():

@@ -276,7 +276,7 @@ def test_noise_at_rest_is_zero_where_no_rest_tells_it(monkeypatch):
     """Of slow streams, no rest holds two samples; a pad may never hold a finite one."""
     pooled = stand_in(PooledPresses, recordings=(None,), data=stand_in(PressData, pressure=np.zeros((5, 2))))
     rests = [np.empty((0, 2))]
-    monkeypatch.setattr("calib.presses.pooled._rests", lambda recording, name: rests)
+    monkeypatch.setattr("calib.presses.pooled._rest_residuals", lambda recording, name: rests)
     np.testing.assert_array_equal(pooled.sensor_noise, [0.0, 0.0])
     rests += [size * np.array([[1.0, np.nan], [-1.0, np.nan]]) for size in (2.0, 3.0, 9.0)]
     np.testing.assert_allclose(pooled.sensor_noise, [3.0, 0.0])
