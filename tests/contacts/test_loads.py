@@ -228,7 +228,7 @@ def test_what_is_not_known_of_the_coat_moves_the_readings_of_a_load(ready):
     sheet = prepare_loads(model, noise=noise).belief.sheet
     theta, forms = rows(SPOT)
     white = jax.jit(lambda sigma: sheet.whiten(transfer(model, coefficients(model, sigma))))
-    factor = sheet._pressed(theta, forms) / sheet.sigma
+    factor = sheet._conductivity(theta, forms) / sheet.sigma
     change = lambda mode: (lambda s: white(s * factor) - white(s))(sheet.sigma * jnp.exp(sheet.coat[:, mode]))  # noqa: E731
     slopes = compiled(sheet.sensitivities, theta, forms).nuisances[:, -sheet.coat.shape[1] :]
     strongest = int(jnp.argmax(jnp.linalg.norm(slopes, axis=0)))
