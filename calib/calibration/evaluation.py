@@ -14,7 +14,7 @@ import numpy as np
 
 import jaxeit as je
 
-from ..fitting.cross_validation.held_out import Split, interval, place_draws
+from ..fitting.cross_validation.held_out import Split, bootstrap_interval, place_draws
 
 CALIBRATED = "calibrated"
 FORCE_THIRDS = ("small", "middle", "large")
@@ -173,7 +173,7 @@ class Evaluation:
         if not self._places.any():
             return {}
         drawn = statistic(values, self._draws)
-        low, high = interval(drawn)
+        low, high = bootstrap_interval(drawn)
         return {"se": float(drawn.std(ddof=1)), "low": low, "high": high}
 
     def by_method(self) -> list[MethodErrors]:

@@ -7,9 +7,9 @@ W = R^-1 - R^-1 U (U' R^-1 U)^+ U' R^-1. Along them the posterior is the prior. 
 divided by the Cholesky factor of R, and the posterior is found by a QR decomposition of them under those of the prior.
 
 An outlier has an independent error besides that of R: variance R_ii (1 / w - 1), with the weights w = 1 for residuals
-within `USUAL` deviations and of Cauchy's distribution beyond, iterated. Multiplying the rows of R instead would take
-the errors that neighbours share for differences between them, and so overstate what is known. Deviations are the larger
-of the stated and the median one, so that a start far away does not select a few observations.
+within `OUTLIER_DEVIATIONS` and of Cauchy's distribution beyond, iterated. Multiplying the rows of R instead would take
+the errors that neighbours share for differences between them, and so overstate the information. Deviations are the
+larger of the stated and the median one, so that a start far away does not select a few observations.
 """
 
 from collections.abc import Callable
@@ -21,14 +21,14 @@ from scipy.linalg import cholesky, solve_triangular
 
 from ..presses.streams import robust_deviation
 
-USUAL = 2.0  # deviations
-STEPS = 30
-TOLERANCE = 1e-7  # largest step of a log gain at the end
-DETERMINED_RATIO = 0.5  # standard deviation of a determined gain over that of its prior, at most
+OUTLIER_DEVIATIONS = 2.0  # deviations, beyond which an observation loses weight
+MAX_STEPS = 30
+GAIN_ATOL = 1e-7  # largest step of a log gain at the end
+MAX_DETERMINED_RATIO = 0.5  # largest standard deviation of a determined gain, over that of its prior
 
 
 class GainPrior(NamedTuple):
-    """What is known of the log gains before the data, as a normal distribution: mean (pads,), covariance."""
+    """Prior of the log gains, a normal distribution: mean (pads,), covariance."""
 
     mean: Float[np.ndarray, " pads"]
     covariance: Float[np.ndarray, "pads pads"]
@@ -93,56 +93,57 @@ def update_gains(
     known = solve_triangular(cholesky(prior.covariance, lower=True), np.eye(len(gain)), lower=True)
     sigma, weight, misfit, scatter = np.sqrt(np.diag(covariance)), np.ones(n), 1.0, 0.0
     rows = np.zeros((0, len(gain)))
-    for _ in range(STEPS if n else 0):
-        rows, residual = _whitened(covariance, weight, free, *residuals(gain))
+    for _ in range(MAX_STEPS if n else 0):
+        rows, residual = _whiten(covariance, weight, free, *residuals(gain))
         orthogonal, triangle = np.linalg.qr(np.concatenate([known, rows]))
         step = solve_triangular(triangle, orthogonal.T @ np.concatenate([known @ (prior.mean - gain), residual]))
         gain = gain + step
         fitted = free.shape[1] + np.sum(orthogonal[len(gain) :] ** 2)
         # Residuals of a fit are smaller than the errors, as n - fitted to n.
-        left = _without(free, covariance, weight, residuals(gain)[0]) * np.sqrt(n / max(n - fitted, 1.0))
-        scatter, misfit = robust_deviation(left), robust_deviation(left / sigma)
-        weight = np.minimum(1.0, (1 + USUAL**2) / (1 + (left / sigma / max(misfit, 1.0)) ** 2))
-        if np.abs(step).max() < TOLERANCE:
+        corrected = _residual_without(free, covariance, weight, residuals(gain)[0]) * np.sqrt(n / max(n - fitted, 1.0))
+        scatter, misfit = robust_deviation(corrected), robust_deviation(corrected / sigma)
+        weight = np.minimum(1.0, (1 + OUTLIER_DEVIATIONS**2) / (1 + (corrected / sigma / max(misfit, 1.0)) ** 2))
+        if np.abs(step).max() < GAIN_ATOL:
             break
-    scale = misfit if misfit > _largest_usual(n) else 1.0
+    scale = misfit if misfit > _max_misfit(n) else 1.0
     root = solve_triangular(np.linalg.qr(np.concatenate([known, rows / scale]), mode="r"), np.eye(len(gain)))
     posterior = root @ root.T
-    determined = _determined(prior, posterior, nuisance is not None)
+    determined = _is_determined(prior, posterior, nuisance is not None)
     return GainUpdate(gain, posterior, determined, misfit, scatter, weight)
 
 
-def _largest_usual(n: int) -> float:
-    """Misfit that sound residuals exceed in a few percent of cases."""
+def _max_misfit(n: int) -> float:
+    """Misfit that residuals of the stated errors exceed in a few percent of cases."""
     return float(1 + 2.4 / np.sqrt(max(n, 1)))
 
 
-def _whitened(
+def _whiten(
     covariance: np.ndarray, weight: np.ndarray, free: np.ndarray, residual: np.ndarray, slope: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Slopes and residuals of weighted observations in their errors, with the directions `free` projected out."""
     root = cholesky(covariance + np.diag(np.diag(covariance) * (1 / weight - 1)), lower=True)
     white = solve_triangular(root, np.column_stack([slope, residual, free]), lower=True)
-    kept, held = np.split(white, [slope.shape[1] + 1], axis=1)
-    kept = kept - held @ np.linalg.lstsq(held, kept, rcond=None)[0] if held.shape[1] else kept
-    return kept[:, :-1], kept[:, -1]
+    rows, directions = np.split(white, [slope.shape[1] + 1], axis=1)
+    if directions.shape[1]:
+        rows = rows - directions @ np.linalg.lstsq(directions, rows, rcond=None)[0]
+    return rows[:, :-1], rows[:, -1]
 
 
-def _without(free: np.ndarray, covariance: np.ndarray, weight: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Residuals minus what the directions `free` explain of them, by weighted least squares."""
+def _residual_without(free: np.ndarray, covariance: np.ndarray, weight: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Residuals after a weighted least-squares fit of the directions `free`."""
     if not free.shape[1]:
         return residual
     root = np.sqrt(weight / np.diag(covariance))
     return np.asarray(residual - free @ np.linalg.lstsq(free * root[:, None], residual * root, rcond=None)[0])
 
 
-def relative(covariance: Float[np.ndarray, "pads pads"]) -> Float[np.ndarray, "pads pads"]:
+def relative_covariance(covariance: Float[np.ndarray, "pads pads"]) -> Float[np.ndarray, "pads pads"]:
     """Covariance of the log gains minus their mean over the pads."""
     pads = len(covariance)
     centre = np.eye(pads) - 1 / pads
     return np.asarray(centre @ covariance @ centre)
 
 
-def _determined(prior: GainPrior, posterior: np.ndarray, is_relative: bool) -> np.ndarray:
-    before, after = (relative(c) if is_relative else c for c in (prior.covariance, posterior))
-    return np.asarray(np.diag(after) < DETERMINED_RATIO**2 * np.diag(before))
+def _is_determined(prior: GainPrior, posterior: np.ndarray, is_relative: bool) -> np.ndarray:
+    before, after = (relative_covariance(c) if is_relative else c for c in (prior.covariance, posterior))
+    return np.asarray(np.diag(after) < MAX_DETERMINED_RATIO**2 * np.diag(before))

@@ -19,12 +19,12 @@ import jaxeit as je
 COVERAGE = 0.9  # of the intervals
 NORMAL_MULTIPLE = 1.6449  # half the width of a normal distribution's 90 % interval, in standard deviations
 MIN_GROUPS = 10  # of held-out readings; fewer determine no multiple, and the normal one is used
-# Groups' worth of readings that speak for the common deviation, against those of the pad itself.
+# Weight of the common deviation against that of a pad, in groups of readings.
 PRIOR_GROUPS = 5.0
-# Least size of a part of the noise, over that with which the part alone would make all of it. Without a bound, readings
-# that a model meets exactly, such as a force of zero without load, would end as noise of zero.
-LEAST_PART = 0.01
-MOST_STEPS, TOLERANCE = 200, 1e-5  # of the search for the sizes; the tolerance is relative, of a variance
+# Least size of a component of the noise, over that with which it alone would be all of the noise. Without a bound,
+# readings that a model fits exactly, such as a force of zero without load, would lead to noise of zero.
+MIN_SIZE_RATIO = 0.01
+MAX_STEPS, VARIANCE_RTOL = 200, 1e-5  # of the Fisher scoring
 
 
 class NoiseLaw(eqx.Module):
@@ -45,8 +45,8 @@ class NoiseLaw(eqx.Module):
 
     def variance(self, force: Float[Array, "*n pads"]) -> Float[Array, "*n pads"]:
         """Variance (N^2) of a new reading about each pad's predicted force (N)."""
-        found: Float[Array, "*n pads"] = _variances(self, force)
-        return found
+        variances: Float[Array, "*n pads"] = _variances(self, force)
+        return variances
 
     def half_widths(self, force: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """Half the 90 % interval of the total of predicted forces (n, pads) N, (n,) N; `variance` of that total by
@@ -66,7 +66,7 @@ def fit_noise(
     variance: Float[np.ndarray, " n"],
     group: np.ndarray,
 ) -> NoiseLaw:
-    """The noise law of held-out residuals of the total force.
+    """Fit the noise law to held-out residuals of the total force.
 
     Args:
         residual: measured minus predicted total force, N; rows that are not finite are left out.
@@ -74,17 +74,17 @@ def fit_noise(
         variance: of the predicted total force, by the model, N^2.
         group: place or press (n,) of each row. Rows of a group count as one, because they err together.
     """
-    sound = np.isfinite(residual) & np.isfinite(force).all(1) & np.isfinite(variance)
-    residual, force, variance, group = residual[sound], force[sound], variance[sound], group[sound]
+    finite = np.isfinite(residual) & np.isfinite(force).all(1) & np.isfinite(variance)
+    residual, force, variance, group = residual[finite], force[finite], variance[finite], group[finite]
     _, group, count = np.unique(group, return_inverse=True, return_counts=True)
     weight = 1 / count[group]
     scale = np.ones(force.shape[1])
-    floor, fraction = _most_likely(residual, force, variance, weight, scale)
+    floor, fraction = _fit_floor_and_fraction(residual, force, variance, weight, scale)
     if len(count) >= MIN_GROUPS and len(scale) > 1:
-        scale = _of_pads(residual, force, variance + _variance(floor, fraction, scale, force), weight)
-        floor, fraction = _most_likely(residual, force, variance, weight, scale)
+        scale = _pad_scales(residual, force, variance + _variance(floor, fraction, scale, force), weight)
+        floor, fraction = _fit_floor_and_fraction(residual, force, variance, weight, scale)
     pull = residual / np.sqrt(np.maximum(variance + _variance(floor, fraction, scale, force), np.finfo(float).tiny))
-    multiple = _multiple(np.abs(pull), weight, len(count))
+    multiple = _conformal_multiple(np.abs(pull), weight, len(count))
     return NoiseLaw(*map(jnp.asarray, (floor, fraction, scale, multiple)))
 
 
@@ -93,22 +93,22 @@ def _variance(floor: float, fraction: float, scale: np.ndarray, force: np.ndarra
     return np.asarray((floor**2 + (fraction * force) ** 2) @ scale**2)
 
 
-def _most_likely(
+def _fit_floor_and_fraction(
     residual: np.ndarray, force: np.ndarray, variance: np.ndarray, weight: np.ndarray, scale: np.ndarray
 ) -> tuple[float, float]:
     """Floor (N) and fraction of largest normal likelihood."""
     terms = np.stack([np.full(len(force), (scale**2).sum()), force**2 @ scale**2], 1)
-    floor, fraction = most_likely_sizes(residual, variance, weight, terms)
+    floor, fraction = fit_variance_components(residual, variance, weight, terms)
     return float(floor), float(fraction)
 
 
-def most_likely_sizes(
+def fit_variance_components(
     residual: Float[np.ndarray, " n"],
     variance: Float[np.ndarray, " n"],
     weight: Float[np.ndarray, " n"],
     terms: Float[np.ndarray, "n terms"],
 ) -> Float[np.ndarray, " terms"]:
-    """Sizes s of largest normal likelihood, if residuals have the variances `variance + terms @ s^2`.
+    """Sizes s of the components of a variance, `variance + terms @ s^2`, by maximum normal likelihood.
 
     Args:
         residual: of readings, in any unit.
@@ -116,56 +116,57 @@ def most_likely_sizes(
         weight: of each reading in the likelihood.
         terms: squares, not negative; a term that is zero throughout has size 0.
     """
-    out = np.zeros(terms.shape[1])
-    size = float(np.sqrt(np.average(residual**2, weights=weight))) if len(residual) else 0.0
-    used = (terms > 0).any(0) if len(terms) else np.zeros(len(out), bool)
-    if size == 0 or not used.any():
-        return out
+    sizes = np.zeros(terms.shape[1])
+    rms = float(np.sqrt(np.average(residual**2, weights=weight))) if len(residual) else 0.0
+    used = (terms > 0).any(0) if len(terms) else np.zeros(len(sizes), bool)
+    if rms == 0 or not used.any():
+        return sizes
     terms = terms[:, used]
-    alone = size**2 / np.average(terms, axis=0, weights=weight)  # square of a size that makes all of the variance
-    least = LEAST_PART**2 * alone
+    # Squares of the sizes with which each term is all of the variance.
+    full = rms**2 / np.average(terms, axis=0, weights=weight)
+    least = MIN_SIZE_RATIO**2 * full
     known = variance + terms @ least
-    starts = np.exp(-6 * (1 - np.eye(len(alone)))) * alone  # one term holds nearly all of the variance
-    tried = [_scored(residual**2, known, weight, terms, start) for start in starts]
-    out[used] = np.sqrt(least + min(tried, key=lambda one: one[1])[0])
-    return out
+    starts = np.exp(-6 * (1 - np.eye(len(full)))) * full  # one term is nearly all of the variance
+    minima = [_fisher_scoring(residual**2, known, weight, terms, start) for start in starts]
+    sizes[used] = np.sqrt(least + min(minima, key=lambda minimum: minimum[1])[0])
+    return sizes
 
 
-def _scored(
+def _fisher_scoring(
     square: np.ndarray, known: np.ndarray, weight: np.ndarray, terms: np.ndarray, start: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Parts of the variance, not negative, of least -2 log likelihood, and that likelihood up to a constant.
+    """Components of the variance, not negative, of least deviance, -2 log likelihood; and the deviance.
 
     Fisher scoring: each step is the least-squares fit of the squares of residuals, weighted by their expected
     variances; it is halved until the likelihood does not fall.
     """
 
-    def misfit(parts: np.ndarray) -> float:
+    def deviance(parts: np.ndarray) -> float:
         total = known + terms @ parts
         return float(weight @ (np.log(total) + square / total))
 
-    parts, now = start, misfit(start)
-    for _ in range(MOST_STEPS):
+    parts, best = start, deviance(start)
+    for _ in range(MAX_STEPS):
         row = np.sqrt(weight) / (known + terms @ parts)
         step = nnls(row[:, None] * terms, row * (square - known))[0] - parts
-        while (after := misfit(parts + step)) > now and np.any(np.abs(step) > TOLERANCE * parts):
+        while (after := deviance(parts + step)) > best and np.any(np.abs(step) > VARIANCE_RTOL * parts):
             step = step / 2
-        if after > now:
+        if after > best:
             break
-        parts, now = parts + step, after
-        if np.all(np.abs(step) <= TOLERANCE * parts):
+        parts, best = parts + step, after
+        if np.all(np.abs(step) <= VARIANCE_RTOL * parts):
             break
-    return parts, now
+    return parts, best
 
 
 def student_factor(freedom: int) -> float:
-    """How much wider the 90 % interval is where the deviation is known from so many degrees of freedom (Student's
-    distribution), over that of a known deviation."""
+    """Width of the 90 % interval of Student's distribution of so many degrees of freedom, over that of a known
+    deviation."""
     return float(student_t.ppf(0.5 + COVERAGE / 2, freedom)) / NORMAL_MULTIPLE
 
 
-def _of_pads(residual: np.ndarray, force: np.ndarray, total: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Scale (pads,): deviation of the presses on a pad over that of all, drawn to one where they are few."""
+def _pad_scales(residual: np.ndarray, force: np.ndarray, total: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Scale (pads,): deviation of the presses on a pad over that of all, shrunk to one where they are few."""
     size = np.abs(force)
     share = weight[:, None] * size / np.maximum(size.sum(1), np.finfo(float).tiny)[:, None]
     square = share.T @ (residual**2 / total)
@@ -173,8 +174,8 @@ def _of_pads(residual: np.ndarray, force: np.ndarray, total: np.ndarray, weight:
     return np.asarray(scale)
 
 
-def _multiple(pull: np.ndarray, weight: np.ndarray, groups: int) -> float:
-    """Size of the pull below which a fraction `COVERAGE` of the readings of a new group are expected.
+def _conformal_multiple(pull: np.ndarray, weight: np.ndarray, groups: int) -> float:
+    """Quantile of the pull for a coverage of `COVERAGE` of the readings of a new group (split conformal prediction).
 
     Args:
         pull: errors over their standard deviations, not negative.
@@ -185,5 +186,5 @@ def _multiple(pull: np.ndarray, weight: np.ndarray, groups: int) -> float:
         return NORMAL_MULTIPLE
     order = np.argsort(pull)
     below = np.cumsum(weight[order]) / groups
-    at = int(np.searchsorted(below, min(COVERAGE * (1 + 1 / groups), 1.0)))
-    return float(pull[order[min(at, len(order) - 1)]])
+    rank = int(np.searchsorted(below, min(COVERAGE * (1 + 1 / groups), 1.0)))
+    return float(pull[order[min(rank, len(order) - 1)]])

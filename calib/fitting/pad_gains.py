@@ -1,4 +1,4 @@
-"""Gains of pads that have moved since the calibration, applied at the door of their pressures.
+"""Gains of pads that have drifted since the calibration, applied to their pressures.
 
 A pad reads exp(log_gain) times the pressure that it read when it was calibrated. Dividing by this gain gives what the
 calibration would have read, so that curve, field, memory and calibrated range apply as they are. The uncertainty of the
@@ -27,22 +27,22 @@ class PadGains(eqx.Module):
     log_gain: Float[Array, " pads"] = eqx.field(converter=jnp.asarray)
     covariance: Float[Array, "pads pads"] = eqx.field(converter=jnp.asarray)
 
-    def unmoved(self, pressures: Float[Array, "n pads"]) -> Float[Array, "n pads"]:
-        """What the pads would have read at the calibration."""
+    def to_calibrated(self, pressures: Float[Array, "n pads"]) -> Float[Array, "n pads"]:
+        """Pressures that the pads would have read at the calibration."""
         return pressures * jnp.exp(-self.log_gain).astype(pressures.dtype)
 
     def forces(self, response: Callable[[Array], PadPrediction], pressures: Float[Array, "n pads"]) -> PadPrediction:
         """Prediction of `response`, a function of calibrated pressures (n, pads) Pa, from pressures as read now."""
-        then = self.unmoved(pressures)
-        found, slopes = response(then), gain_slopes(lambda p: response(p).force, then)
-        variance, of_total = self._variance(slopes), self._variance(jnp.sum(slopes, -1, keepdims=True))[:, 0]
+        calibrated = self.to_calibrated(pressures)
+        found, slopes = response(calibrated), gain_slopes(lambda p: response(p).force, calibrated)
+        variance, total = self._variance(slopes), self._variance(jnp.sum(slopes, -1, keepdims=True))[:, 0]
         return found._replace(
             standard_error=jnp.sqrt(found.standard_error**2 + variance),
-            total_variance=found.total_variance + of_total,
+            total_variance=found.total_variance + total,
         )
 
     def _variance(self, slopes: Float[Array, "pads n k"]) -> Float[Array, "n k"]:
-        """Variance (N^2) of forces with these slopes by the gains, whose errors pads may have in common."""
+        """Variance (N^2) of forces with these slopes by the gains, whose errors may be correlated."""
         found = jnp.einsum("qnr,qs,snr->nr", slopes, self.covariance.astype(slopes.dtype), slopes)
         return jnp.maximum(found, 0)
 

@@ -1,11 +1,11 @@
 """The response of all pads together: a curve for each pad, times a field of gain over the place pressed.
 
-Curves and field are fitted in turn. Given the field, `fit_curves` fits each curve to the force that its pad carries,
-over the gain: the measured force less that of the other pads by their own curves, so that presses across the edge of
-two pads count for both. Given the curves, `fit_field` is a linear fit in log force, with evidence and covariance in
-closed form. The mean of the field over the presses of a pad is zero, so that neither changes the level of the other:
-the covariance of each is complete, and a few alternations agree to well within the noise. One joint least-squares
-problem would give the same numbers, but neither the evidence nor the sandwich covariance over places.
+Curves and field are fitted in turn (backfitting). Given the field, `fit_curves` fits each curve to the force that its
+pad carries, over the gain: the measured force less that of the other pads by their own curves, so that presses across
+the edge of two pads count for both. Given the curves, `fit_field` is a linear fit in log force, with evidence and
+covariance in closed form. The mean of the field over the presses of a pad is zero, so that neither changes the level of
+the other: the covariance of each is complete, and a few alternations agree to well within the noise. One joint
+least-squares problem would give the same numbers, but neither the evidence nor the sandwich covariance over places.
 """
 
 from typing import NamedTuple
@@ -36,7 +36,7 @@ from .pad_gains import PadGains
 from .pad_predictions import PadPrediction, independent, with_gain
 from .results import FitResult
 
-ALTERNATIONS = 2  # fits of the field, then of the curves; more change the result by far less than the noise
+ALTERNATIONS = 2  # of fits of the field and of the curves; more change the result by far less than the noise
 # Fraction of the largest force below which presses weigh less: their noise is constant, not proportional to the force.
 FAINT_FORCE = 0.05
 # Fraction of the largest fitted pressure below which the force of a curve that is not zero at rest falls to zero.
@@ -95,9 +95,9 @@ class PadModel(eqx.Module):
 
     def own(self, readings: Float[Array, "n pads"]) -> Float[Array, "n pads"]:
         """The pads' own pressures at the time of the fit, without crosstalk, from readings (n, pads) Pa; pure."""
-        return self._unmixed(readings if self.gains is None else self.gains.unmoved(readings))
+        return self._remove_crosstalk(readings if self.gains is None else self.gains.to_calibrated(readings))
 
-    def _unmixed(self, readings: Float[Array, "n pads"]) -> Float[Array, "n pads"]:
+    def _remove_crosstalk(self, readings: Float[Array, "n pads"]) -> Float[Array, "n pads"]:
         return readings if self.crosstalk is None else own_pressures(self.crosstalk, readings)
 
     def forces(
@@ -108,19 +108,19 @@ class PadModel(eqx.Module):
     ) -> PadPrediction:
         """Forces from readings (n, pads) Pa and own pressures `before` them, with the errors of the gains; pure."""
 
-        def response(unmoved: Array) -> PadPrediction:
-            return self._continued(self._unmixed(unmoved), places, before)
+        def response(calibrated: Array) -> PadPrediction:
+            return self._predict_after(self._remove_crosstalk(calibrated), places, before)
 
         return response(readings) if self.gains is None else self.gains.forces(response, readings)
 
-    def _continued(self, own: Array, places: Places | None, before: Array | None) -> PadPrediction:
+    def _predict_after(self, own: Array, places: Places | None, before: Array | None) -> PadPrediction:
         """`predict` for curves with memory that start from own pressures `before` (m, pads)."""
         if before is None:
             return self.predict(own, places)
-        first, whole = len(before), jnp.concatenate([before, own])
+        first, series = len(before), jnp.concatenate([before, own])
         if places is not None:
-            places = places[jnp.maximum(jnp.arange(len(whole)) - first, 0)]
-        return PadPrediction(*(part[first:] for part in self.predict(whole, places)))
+            places = places[jnp.maximum(jnp.arange(len(series)) - first, 0)]
+        return PadPrediction(*(part[first:] for part in self.predict(series, places)))
 
     @property
     def coefficients(self) -> float:
@@ -135,13 +135,13 @@ class PadModel(eqx.Module):
         if self.sensor is None:
             return floor
         rest = jnp.zeros_like(self.sensor)[None]
-        level, noisy = predict(self, jnp.concatenate([rest, self._noise_of_own(rest)])).force
+        level, noisy = predict(self, jnp.concatenate([rest, self._own_noise(rest)])).force
         return jnp.hypot(floor, noisy - level)
 
     def predict(self, own: Float[Array, "n pads"], places: Places | None = None) -> PadPrediction:
         """Forces from the pads' own pressures (n, pads) Pa; pure. Without places the gain is one, and the standard
         error includes its variation over the pad."""
-        found = _of_curves(self.curves, own)
+        found = _curve_predictions(self.curves, own)
         if self.field is None:
             return independent(found)
         gain = self.field.log_gain(nowhere(own) if places is None else places)
@@ -161,19 +161,19 @@ class PadModel(eqx.Module):
         found = self.forces(readings, places, before)
         variance = self._noise.variance(found.force)
         if self.sensor is not None:
-            # The force of a pad depends on its own pressure alone, so that all pads may be moved at once.
-            noisy = self.own(readings) + self._noise_of_own(readings)
-            variance += (self._continued(noisy, places, before).force - found.force) ** 2
+            # The force of a pad depends on its own pressure alone, so that all pads may be perturbed at once.
+            noisy = self.own(readings) + self._own_noise(readings)
+            variance += (self._predict_after(noisy, places, before).force - found.force) ** 2
         return found.with_noise(variance)
 
-    def _noise_of_own(self, readings: Float[Array, "n pads"]) -> Float[Array, "n pads"]:
+    def _own_noise(self, readings: Float[Array, "n pads"]) -> Float[Array, "n pads"]:
         """Standard deviation of the pads' own pressures (Pa) by the noise of the sensors, which must be known.
 
         A channel without a reading (NaN) adds nothing to the other pads.
         """
         assert self.sensor is not None
         noise = jnp.where(jnp.isfinite(readings), self.sensor, 0)
-        noise = noise if self.gains is None else self.gains.unmoved(noise)
+        noise = noise if self.gains is None else self.gains.to_calibrated(noise)
         return noise if self.crosstalk is None else own_deviations(self.crosstalk, noise)
 
     def pad_forces(
@@ -258,41 +258,41 @@ def fit_pads(
     data, places = presses.data, presses.of(field)
     use = np.ones(len(data.force), bool) if use is None else use
     gain, fitted = np.zeros_like(data.pressure), None
-    curves = _curves(curve, data, data.share[data.sample_press].T * data.sample_force, gain, use, loss)
+    curves = _fit_pad_curves(curve, data, data.share[data.sample_press].T * data.sample_force, gain, use, loss)
     alone = data.pressure.shape[1] == 1 and field is None
     for _ in range(0 if alone else ALTERNATIONS):
         if field is not None and places is not None:
-            fitted = _field(field, curves, gain, presses, use)
+            fitted = _fit_gains(field, curves, gain, presses, use)
             gain = by_rows(log_gain, places, before=(fitted,)).mean
-        curves = _curves(curve, data, _carried(curves, data, gain), gain, use, loss)
+        curves = _fit_pad_curves(curve, data, _partial_residuals(curves, data, gain), gain, use, loss)
     return PadModel(curves, fitted)
 
 
-def _carried(curves: FittedCurve, data: PressData, gain: np.ndarray) -> np.ndarray:
+def _partial_residuals(curves: FittedCurve, data: PressData, gain: np.ndarray) -> np.ndarray:
     """Force on each pad at all samples, (pads, n) N: the measured force less that of the other pads by their curves."""
-    each = np.nan_to_num(by_rows(_curve_forces, data.sample_pressure.T, before=(curves,)).T)
-    each *= np.exp(gain[data.sample_press].T)
-    return np.asarray(data.sample_force - (each.sum(0) - each))
+    fitted = np.nan_to_num(by_rows(_curve_forces, data.sample_pressure.T, before=(curves,)).T)
+    fitted *= np.exp(gain[data.sample_press].T)
+    return np.asarray(data.sample_force - (fitted.sum(0) - fitted))
 
 
-def _curves(
+def _fit_pad_curves(
     curve: AbstractCurve, data: PressData, force: np.ndarray, gain: np.ndarray, use: np.ndarray, loss: AbstractLoss
 ) -> FittedCurve:
     """Each pad's curve, fitted to its forces (pads, n) N over gains; the noise is divided by the gain too."""
     own = data.pad_samples(with_history=curve.path)
-    less = np.exp(-np.take_along_axis(gain[data.sample_press].T, own.rows, 1))
+    inverse_gain = np.exp(-np.take_along_axis(gain[data.sample_press].T, own.rows, 1))
     mask = own.mask & use[data.sample_press][own.rows]
-    if not _zero_at_rest(curve):
+    if not _is_zero_at_rest(curve):
         top = np.where(mask, own.pressure, 0).max(1, initial=0)
         mask &= own.pressure >= REST_FRACTION * top[:, None]
-    force = np.take_along_axis(force, own.rows, 1) * less
-    return fit_curves(curve, own.pressure, force, mask=mask, groups=own.place, sigma=less, loss=loss)
+    force = np.take_along_axis(force, own.rows, 1) * inverse_gain
+    return fit_curves(curve, own.pressure, force, mask=mask, groups=own.place, sigma=inverse_gain, loss=loss)
 
 
 _fit_field = je.verb(fit_field)
 
 
-def _field(
+def _fit_gains(
     field: AbstractField, curves: FittedCurve, gain: np.ndarray, presses: LocatedPresses, use: np.ndarray
 ) -> FittedField:
     """The field fitted to log forces over those of the curves, which were fitted with the log-gain `gain`."""
@@ -303,16 +303,16 @@ def _field(
     use = use & (total > 0) & (data.force > 0)
     share = part / np.where(total > 0, total, 1)[:, None]
     log_ratio = np.log(np.where(use, data.force / np.where(use, total, 1), 1)) + (share * gain).sum(1)
-    weight = np.where(use, _weights(data.force, data.place, use), 0)
+    weight = np.where(use, _press_weights(data.force, data.place, use), 0)
     extra = bucket(len(use)) - len(use)  # presses without weight, so that compiled fits are reused
     rows = [np.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)) for a in (log_ratio, share, weight)]
-    wide = jax.tree.map(lambda a: np.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)), presses.of(field))
+    places = jax.tree.map(lambda a: np.pad(a, [(0, extra)] + [(0, 0)] * (a.ndim - 1)), presses.of(field))
     y, x, w = map(jax.device_put, rows)
-    return _fit_field(field, presses.geometry, wide, y, x, w, jax.device_put(data.reach))
+    return _fit_field(field, presses.geometry, places, y, x, w, jax.device_put(data.reach))
 
 
-def _weights(force: np.ndarray, place: np.ndarray, use: np.ndarray) -> np.ndarray:
-    """Weights of the presses, (presses,): those at one place sum to one at most, faint presses weigh less."""
+def _press_weights(force: np.ndarray, place: np.ndarray, use: np.ndarray) -> np.ndarray:
+    """Weights of the presses, (presses,): at most one for all at a place, and less for faint presses."""
     faint = FAINT_FORCE * force[use].max(initial=0)
     weight = force**2 / (force**2 + faint**2)
     return np.asarray(weight / np.maximum(np.bincount(place, use)[place], 1))
@@ -326,12 +326,12 @@ class PadForces(NamedTuple):
     total_variance: np.ndarray
 
 
-def over_holds(model: PadModel, presses: LocatedPresses) -> PadForces:
+def predict_holds(model: PadModel, presses: LocatedPresses) -> PadForces:
     """Pad forces over the holds of the presses, (presses, pads)."""
-    return _of_fits(model, by_rows(predict, presses.data.pressure, presses.places, before=(model,)))
+    return _valid_forces(model, by_rows(predict, presses.data.pressure, presses.places, before=(model,)))
 
 
-def along_presses(model: PadModel, presses: LocatedPresses) -> PadForces:
+def predict_samples(model: PadModel, presses: LocatedPresses) -> PadForces:
     """Pad forces at all samples of the presses, (n, pads)."""
     data = presses.data
     gain = (
@@ -340,19 +340,19 @@ def along_presses(model: PadModel, presses: LocatedPresses) -> PadForces:
         else by_rows(log_gain, presses.places, before=(model.field,))
     )
     rows = data.sample_pressure.T, None if gain is None else LogGain(*(part[data.sample_press] for part in gain))
-    return _of_fits(model, by_rows(_with_gains, *rows, before=(model,)))
+    return _valid_forces(model, by_rows(_with_gains, *rows, before=(model,)))
 
 
 @je.verb
 def _with_gains(model: PadModel, own: Float[Array, "n pads"], gain: LogGain | None) -> PadPrediction:
     """`PadModel.predict` with known gains (None: the curves alone)."""
-    found = _of_curves(model.curves, own)
+    found = _curve_predictions(model.curves, own)
     return (
         independent(found) if model.field is None or gain is None else with_gain(found, gain, model.field.field.shared)
     )
 
 
-def _of_fits(model: PadModel, found: PadPrediction) -> PadForces:
+def _valid_forces(model: PadModel, found: PadPrediction) -> PadForces:
     good = np.asarray(model.curves.result) == FitResult.SUCCESS
     return PadForces(np.where(good, found.force, np.nan), np.asarray(found.total_variance))
 
@@ -360,25 +360,25 @@ def _of_fits(model: PadModel, found: PadPrediction) -> PadForces:
 @je.verb
 def _curve_forces(curves: FittedCurve, pressure: Float[Array, "n pads"]) -> Float[Array, "n pads"]:
     found: Array = eqx.filter_vmap(lambda fitted, p: fitted.curve(fitted.parameters, p))(curves, pressure.T)
-    return (found * _load(curves, pressure.T)).T
+    return (found * _load_factor(curves, pressure.T)).T
 
 
-def _of_curves(curves: FittedCurve, own: Float[Array, "n pads"]) -> Prediction:
+def _curve_predictions(curves: FittedCurve, own: Float[Array, "n pads"]) -> Prediction:
     """Forces of the curves of all pads, (n, pads); a pad at rest bears none, whatever the offset of its curve."""
-    found, load = predict_pads(curves, own.T), _load(curves, own.T)
+    found, load = predict_pads(curves, own.T), _load_factor(curves, own.T)
     return Prediction((found.force * load).T, (found.standard_error * load).T, found.valid.T)
 
 
-def _zero_at_rest(curve: AbstractCurve) -> bool:
+def _is_zero_at_rest(curve: AbstractCurve) -> bool:
     return bool(curve.positive.all()) and not curve.path
 
 
-def _load(curves: FittedCurve, pressure: Float[Array, "pads n"]) -> Float[Array, "#pads #n"]:
+def _load_factor(curves: FittedCurve, pressure: Float[Array, "pads n"]) -> Float[Array, "#pads #n"]:
     """From 0 at rest to 1 for a loaded pad; 1 everywhere for curves that are zero at rest by themselves.
 
     The offset of a curve, or the force that its memory holds, would otherwise count for every pad of the skin,
     pressed or not.
     """
-    if _zero_at_rest(curves.curve):
+    if _is_zero_at_rest(curves.curve):
         return jnp.ones((1, 1), pressure.dtype)
     return jnp.clip(pressure / (REST_FRACTION * curves.pressure_range[:, 1:]), 0, 1)

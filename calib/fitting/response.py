@@ -9,9 +9,9 @@ import numpy as np
 import jaxeit as je
 
 from ..presses.pooled import PressData
-from .cross_validation.held_out import Folds, Split, folds_by_place, hold_out_image, leave_out
+from .cross_validation.held_out import Folds, Split, folds_by_place, hold_out_image, leave_groups_out
 from .cross_validation.neighbourhoods import error_scale, hold_out_scaled
-from .cross_validation.selection import Choice, choose, chosen_without
+from .cross_validation.selection import Choice, choose, nested_selection
 from .curves.base import AbstractCurve
 from .curves.elementary import Linear
 from .curves.fitted import FittedCurve
@@ -92,7 +92,7 @@ def fit_response(
     choice = choose(curves, fields, folds)
     model = folds.fit(choice.curve, choice.field, frozenset())
     _require_fits(skin, model)
-    without = chosen_without(curves, fields, folds)
+    without = nested_selection(curves, fields, folds)
     return PadResponse(choice, model, folds.fit(*_baseline(choice), frozenset()).curves, without)
 
 
@@ -137,7 +137,7 @@ def hold_out_response(
     """Predict each press by fits without its place: by the response and by the methods of comparison.
 
     Args:
-        groups: number of each press's part, (presses,), for each kind of part to leave out; see `leave_out`.
+        groups: number of each press's part, (presses,), for each kind of part to leave out; see `leave_groups_out`.
         image_sum: integral of each press's image, (presses,) S m^2.
         true_position: exact positions of the presses, (presses, 2) m, if a simulation made them.
     """
@@ -153,13 +153,13 @@ def hold_out_response(
     held = hold_out_scaled(folds, response.without, 1.0)
     hold_noise = held.hold_noise(data)
     scale = error_scale(folds, curve, response.model, hold_noise)
-    wider = hold_out_scaled(folds, response.without, scale) if scale > 1 else held
+    scaled = hold_out_scaled(folds, response.without, scale) if scale > 1 else held
     return HeldOutForces(
         held.hold.force,
-        held.half_widths(data, wider.hold.total_variance),
+        held.half_widths(data, scaled.hold.total_variance),
         held.noise(data),
         hold_noise,
         scale,
         others,
-        leave_out(curve, field, presses, folds.loss, groups),
+        leave_groups_out(curve, field, presses, folds.loss, groups),
     )

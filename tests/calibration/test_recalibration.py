@@ -20,7 +20,7 @@ from calib.calibration.recalibration.ordinary_use import distinct, loaded_pressu
 from calib.calibration.recalibration.press_noise import press_noise
 from calib.calibration.recalibration.procedure import LoadedPads, SeenContacts, contact_loads, recorded, rest_levels
 from calib.cli import main
-from calib.fitting.gain_update import GainDrift, GainPrior, GainUpdate, relative, update_gains
+from calib.fitting.gain_update import GainDrift, GainPrior, GainUpdate, relative_covariance, update_gains
 from calib.fitting.intervals import NORMAL_MULTIPLE
 from calib.fitting.pad_gains import PadGains
 from calib.fitting.pads import PadModel
@@ -200,7 +200,7 @@ def used(calibration, use):
 def test_ordinary_use_tells_gains_relative_to_each_other(used):
     found = used.recalibration
     true = np.log(GAINS) - np.log(GAINS).mean()
-    error = np.sqrt(np.diag(relative(found.covariance)))
+    error = np.sqrt(np.diag(relative_covariance(found.covariance)))
     assert (np.abs(found.log_gain - true) < 3 * error).all()
     assert (error < 0.05).all()
     assert found.determined.all()
@@ -249,7 +249,7 @@ def test_only_a_pad_that_moved_raises_an_alarm(later):
             loads = contact_loads(calibration, dv, skin.pressures(place, force, gains))
             found = OrdinaryUse().update(calibration, loads, press_noise(calibration.evaluation))
             true = np.log(gains) - np.log(gains).mean()
-            pulls.append((found.mean - true) / np.sqrt(np.diag(relative(found.covariance))))
+            pulls.append((found.mean - true) / np.sqrt(np.diag(relative_covariance(found.covariance))))
             records.append(recorded(calibration, Evidence.ORDINARY_USE, found, np.ones(4), levels, (LATER, "x")))
     assert not [one.health for one in unmoved if one.significant.any()]
     assert sum(one.advice is Advice.RECALIBRATE for one in moved) >= 7
@@ -422,7 +422,7 @@ def simulated_updates(rng, *, use, count=200, n=12):
         )
         away, spread = found.mean - gain, found.covariance
         if use:
-            away, spread = away - away.mean(), relative(spread)
+            away, spread = away - away.mean(), relative_covariance(spread)
         pulls.append(away / np.sqrt(np.diag(spread)))
     return np.array(pulls)
 

@@ -8,12 +8,12 @@ import pytest
 from scipy import linalg, optimize
 
 from calib.fitting.cross_validation.scores import assign_folds, mae, percent_full_scale, rmse, score
-from calib.fitting.cross_validation.selection import Tried, simplest
+from calib.fitting.cross_validation.selection import Option, simplest
 from calib.fitting.curves import Affine, AffinePlay, Linear, MonotoneSpline, PowerLaw, fit_curve, fit_curves
 from calib.fitting.curves.fit import default_solver, fit_samples
 from calib.fitting.curves.fitted import predict_pads
 from calib.fitting.curves.problem import design_effect
-from calib.fitting.curves.samples import Samples, gather
+from calib.fitting.curves.samples import Samples, make_samples
 from calib.fitting.logs import BestChannel, fit_log, time_split
 from calib.fitting.losses import Cauchy, Huber, SoftL1, Squared
 from calib.fitting.results import FitError, FitResult
@@ -177,7 +177,7 @@ def test_a_dead_zone_on_a_loop_is_no_contradiction():
 
 
 def test_samples_without_residuals_err_each_for_itself():
-    samples = jax.tree.map(lambda leaf: leaf[0], gather(np.ones((1, 40)), np.zeros((1, 40)))[0])
+    samples = jax.tree.map(lambda leaf: leaf[0], make_samples(np.ones((1, 40)), np.zeros((1, 40)))[0])
     together = np.repeat([1.0, -1.0], 20)
     assert design_effect(jnp.zeros(40), samples, 0) == 1
     assert design_effect(jnp.asarray(together), samples, 0) == 2  # blocks of two
@@ -331,13 +331,13 @@ def test_wrong_shapes_and_weights_are_refused_in_one_line():
 @pytest.mark.slow
 def test_the_pure_fit_has_gradients():
     pressure, force = (a[:1, :60] for a in pads())
-    samples, _ = gather(pressure, force)
+    samples, _ = make_samples(pressure, force)
     samples = jax.tree.map(lambda leaf: leaf[0], samples)
 
     @jax.jit
     def slope(shift):
         moved = eqx.tree_at(lambda s: s.force, samples, samples.force * (1 + shift))
-        fit = fit_samples(Linear(), moved, Squared(), default_solver(jnp.float64), n_groups=0, rounds=1)
+        fit = fit_samples(Linear(), moved, Squared(), default_solver(jnp.float64), n_groups=0, iterations=1)
         return fit.parameters[0]
 
     # the slope is proportional to the force, so its derivative is itself
@@ -476,7 +476,7 @@ def test_eflesh_is_fitted_without_its_missing_rows():
 def test_the_simplest_of_those_that_are_as_good_is_chosen_and_said():
     """Mean squares 9, 4.2, 4 +- 0.6 and one fit that failed: the second is within a standard error of the least."""
     squares = {"plain": [9.0, 9.0, 9.0], "bent": [4.2, 4.2, 4.2], "free": [3.0, 4.0, 5.0], "failed": [0.1, np.nan, 0.1]}
-    tried = [Tried(name, name, size) for size, name in ((9, "free"), (1, "plain"), (2, "failed"), (4, "bent"))]
+    tried = [Option(name, name, size) for size, name in ((9, "free"), (1, "plain"), (2, "failed"), (4, "bent"))]
     chosen, why, table = simplest("curve", tried, lambda name: np.array(squares[name]), "places")
     assert chosen == "bent"
     assert [(one.name, one.chosen) for one in table] == [
@@ -497,4 +497,4 @@ def test_the_simplest_of_those_that_are_as_good_is_chosen_and_said():
 
 @pytest.mark.slow
 def test_where_there_is_no_choice_nothing_is_scored():
-    assert simplest("curve", [Tried(1, "one", 1)], lambda _: pytest.fail("scored"), "places") == (1, "", ())
+    assert simplest("curve", [Option(1, "one", 1)], lambda _: pytest.fail("scored"), "places") == (1, "", ())

@@ -31,7 +31,7 @@ from calib.fitting.fields import (
     log_gain,
     single_places,
 )
-from calib.fitting.fields.base import restored
+from calib.fitting.fields.base import restore_field
 from calib.fitting.fields.evidence import PRIOR_RATIOS
 from calib.fitting.fields.fitted import pad_features
 from calib.fitting.fields.unpressed_walls import unpressed_note
@@ -164,15 +164,15 @@ def test_every_field_has_its_features_priors_and_settings(name, geometry):
     assert (field.shapes() >= 0).all()
     assert FIELDS.name_of(field) == name
     settings = {f.name: np.asarray(getattr(field, f.name)) for f in fields(field)}
-    assert eqx.tree_equal(restored(type(field), settings), field)
+    assert eqx.tree_equal(restore_field(type(field), settings), field)
 
 
 def test_settings_that_a_field_has_no_more_are_read_where_they_change_nothing():
     same = {"steps": np.asarray(1), "order": np.asarray(0)}
-    assert eqx.tree_equal(restored(PadEdge, same | {"corners": np.asarray(True)}), PadEdge())
+    assert eqx.tree_equal(restore_field(PadEdge, same | {"corners": np.asarray(True)}), PadEdge())
     for kind, settings in ((PadEdge, same | {"order": np.asarray(1)}), (PadEdgeSpline, same)):
         with pytest.raises(TypeError, match="unexpected keyword"):
-            restored(kind, settings)
+            restore_field(kind, settings)
 
 
 def test_the_command_line_knows_every_field_and_curve(capsys):

@@ -8,7 +8,7 @@ from scipy import signal
 from calib.fitting.curves import Affine, AffinePlay, fit_curves
 from calib.fitting.logs import LogSeries, LogTracker, SmoothChannels, fit_series, series_of, ways_of
 from calib.fitting.logs.noise import fit_log_noise, force_rate
-from calib.fitting.logs.series import thinned
+from calib.fitting.logs.series import block_means
 from calib.fitting.losses import Squared
 
 from ..helpers import REAL_DATA
@@ -136,7 +136,7 @@ def test_blocks_are_parts_of_one_log_each_and_the_later_half_decides():
 def test_thinning_takes_means_of_complete_samples():
     time, values = np.arange(7.0), np.array([[1.0], [3.0], [5.0], [np.nan], [7.0], [9.0], [4.0]])
     force = np.array([1.0, np.nan, 2.0, 8.0, np.nan, np.nan, 6.0])
-    t, v, f = thinned(time, values, force, 2)
+    t, v, f = block_means(time, values, force, 2)
     np.testing.assert_array_equal(t, [0.5, 2.5, 4.5, 6.0])
     np.testing.assert_array_equal(v[:, 0], [1.0, 5.0, 8.0, 4.0])
     np.testing.assert_array_equal(f, [1.0, 2.0, np.nan, 6.0])

@@ -12,7 +12,7 @@ from calib.fitting import AffinePlay, PlaySpline
 from calib.fitting.curves import Affine, fit_curves
 from calib.fitting.curves.fitted import predict_pads
 from calib.fitting.logs import SmoothChannels, fit_log
-from calib.fitting.logs.combination import lagged
+from calib.fitting.logs.combination import first_order_lag
 from calib.fitting.results import FitResult
 from calib.presses.channel_faults import faults
 
@@ -48,7 +48,7 @@ def test_a_lag_follows_a_step_by_its_time_constant():
     time = np.cumsum(np.random.default_rng(0).uniform(0.05, 0.2, 200))
     step = np.where(np.arange(200) > 0, 1.0, 0.0)
     step[50] = np.nan
-    out = lagged(time, step, 2.0)
+    out = first_order_lag(time, step, 2.0)
     assert np.isnan(out[50])
     np.testing.assert_allclose(np.delete(out, 50), np.delete(-np.expm1(-(time - time[0]) / 2.0), 50), atol=1e-12)
 
@@ -59,7 +59,7 @@ def test_creep_is_learnt_and_the_second_half_predicted():
     rng = np.random.default_rng(2)
     time = np.arange(0, 120, 0.2)
     load = 10 * (1 + np.sin(time / 3)) * (1 + 0.5 * np.sin(time / 17))
-    felt = load + 0.1 * lagged(time, load, 5.0)
+    felt = load + 0.1 * first_order_lag(time, load, 5.0)
     signals = np.stack([felt, felt**1.2, 3 - 0.5 * felt + 0.02 * felt**2], 1) + rng.normal(0, 0.01, (600, 3))
     with_creep, without = (
         fit_log(Affine(), time * 1e9, signals, load, channels=SmoothChannels((2,), lags)) for lags in ((5.0,), ())

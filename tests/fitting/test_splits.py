@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calib.calibration.evaluation import _cv, _mean, _rms
-from calib.fitting.cross_validation.held_out import interval, leave_out, place_draws
+from calib.fitting.cross_validation.held_out import bootstrap_interval, leave_groups_out, place_draws
 from calib.fitting.curves import Linear
 from calib.fitting.fields import PadEdge, geometry_of, single_places
 from calib.fitting.losses import SoftL1
@@ -41,7 +41,7 @@ def test_intervals_of_a_mean_over_places_cover_it():
     drawn = place_draws(place)
     for _ in range(300):
         values = rng.normal(0, 1, 30)[place] + rng.normal(0, 0.2, 180)
-        low, high = interval(_mean(values, drawn))
+        low, high = bootstrap_interval(_mean(values, drawn))
         hits += low <= 0 <= high
         naive += abs(values.mean()) < 1.645 * values.std() / np.sqrt(180)
     assert 0.84 < hits / 300 < 0.94
@@ -56,7 +56,7 @@ def splits(skin):
         "indenter": np.zeros(len(place), int),
         "session": np.arange(len(place)) % 2,
     }
-    found = leave_out(
+    found = leave_groups_out(
         Linear(), PadEdge(), LocatedPresses(data, geometry_of(skin), single_places(place, 4)), SoftL1(), groups
     )
     return {split.by: split for split in found}
@@ -80,5 +80,5 @@ def test_parts_that_there_are_several_of_are_left_out_and_others_said(splits):
 def test_too_few_parts_to_fit_from_are_said(skin):
     place, data = session_data(skin)
     one = np.where(np.arange(len(place)) < 3, 0, 1)
-    found = leave_out(Linear(), None, LocatedPresses(data, geometry_of(skin)), SoftL1(), {"session": one})
+    found = leave_groups_out(Linear(), None, LocatedPresses(data, geometry_of(skin)), SoftL1(), {"session": one})
     assert "does not determine the fit" in found[0].note

@@ -17,7 +17,7 @@ from calib.fitting.fields import (
     log_gain,
     single_places,
 )
-from calib.fitting.fields.evidence import LevelFree, _of_shape, without_levels
+from calib.fitting.fields.evidence import ProjectedPresses, _shape_posterior, project_out_levels
 from calib.fitting.fields.fit import _supported_box
 from calib.fitting.fields.fitted import pad_features
 from calib.fitting.fields.geometry import distance, nearest_points
@@ -96,8 +96,8 @@ def test_a_pad_without_presses_leaves_the_others_their_levels():
     rng = np.random.default_rng(0)
     z, y, weight = (jnp.asarray(a) for a in (rng.normal(size=(9, 2)), rng.normal(size=9), np.ones(9)))
     share = jnp.asarray(np.eye(2)[np.arange(9) % 2])
-    with_a_third = without_levels(z, y, jnp.pad(share, ((0, 0), (0, 1))), weight)
-    for mine, theirs in zip(with_a_third, without_levels(z, y, share, weight), strict=True):
+    with_a_third = project_out_levels(z, y, jnp.pad(share, ((0, 0), (0, 1))), weight)
+    for mine, theirs in zip(with_a_third, project_out_levels(z, y, share, weight), strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-9)
 
 
@@ -105,9 +105,9 @@ def test_features_that_are_alike_leave_evidence_in_single_precision():
     """Rounding leaves eigenvalues below zero, ten million times which is less than minus one."""
     rng = np.random.default_rng(1)
     z = (rng.normal(size=(20, 2)) @ rng.normal(size=(2, 6))).astype("f4")
-    white = LevelFree(jnp.asarray(z), jnp.asarray(rng.normal(size=20), "f4"), jnp.asarray(18, "f4"))
+    white = ProjectedPresses(jnp.asarray(z), jnp.asarray(rng.normal(size=20), "f4"), jnp.asarray(18, "f4"))
     assert np.linalg.eigvalsh(z.T @ z).min() < -1e-7
-    assert np.isfinite(_of_shape(white, jnp.ones(6, "f4")).evidence).all()
+    assert np.isfinite(_shape_posterior(white, jnp.ones(6, "f4")).evidence).all()
 
 
 @pytest.mark.slow

@@ -22,9 +22,9 @@ from calib.fitting.curves import (
 )
 from calib.fitting.curves.base import scale_of
 from calib.fitting.curves.covariance import cluster_covariance, independent_covariance, thin_svd
-from calib.fitting.curves.fit import held_pressure
+from calib.fitting.curves.fit import fill_gaps
 from calib.fitting.curves.problem import residual_scale, residuals
-from calib.fitting.curves.samples import gather
+from calib.fitting.curves.samples import make_samples
 from calib.fitting.losses import Cauchy, Huber, SoftL1, Squared
 from calib.fitting.results import FitError, FitResult
 from calib.presses import PressError, find_presses
@@ -283,7 +283,7 @@ def test_losses_have_slopes_at_nothing_and_far_away(loss, dtype):
 
 def test_samples_that_only_fill_up_have_no_slope():
     """Not forwards and not backwards, as solvers with iterations inside go."""
-    samples = jax.tree.map(lambda leaf: leaf[0], gather([[1000.0, 2000.0]], [[4.0, 8.0]], length=64)[0])
+    samples = jax.tree.map(lambda leaf: leaf[0], make_samples([[1000.0, 2000.0]], [[4.0, 8.0]], length=64)[0])
     scale = scale_of(samples.pressure, samples.force, samples.valid)
     slope = jax.grad(lambda free: jnp.sum(residuals(free, Linear(), samples, scale, 1.0)))(jnp.zeros(1))
     assert len(samples.valid) > 2
@@ -292,7 +292,7 @@ def test_samples_that_only_fill_up_have_no_slope():
 
 def test_the_scatter_of_exact_samples_is_above_zero_and_of_others_theirs():
     def scatter(force):
-        samples = jax.tree.map(lambda leaf: leaf[0], gather([[1.0, 2.0, 4.0]], [force], length=64)[0])
+        samples = jax.tree.map(lambda leaf: leaf[0], make_samples([[1.0, 2.0, 4.0]], [force], length=64)[0])
         return residual_scale(
             jnp.zeros(1), Linear(), samples, scale_of(*[jnp.asarray([1.0, 2.0, 4.0])] * 2, jnp.ones(3) > 0)
         )
@@ -303,7 +303,7 @@ def test_the_scatter_of_exact_samples_is_above_zero_and_of_others_theirs():
 
 def test_a_pressure_is_held_through_a_gap():
     there = jnp.array([False, True, False, True])
-    np.testing.assert_array_equal(held_pressure(jnp.array([np.nan, 1, np.nan, 3]), there), [0, 1, 1, 3])
+    np.testing.assert_array_equal(fill_gaps(jnp.array([np.nan, 1, np.nan, 3]), there), [0, 1, 1, 3])
 
 
 def test_presses_that_alone_decide_or_are_outweighed_by_outliers_are_too_few():

@@ -16,7 +16,7 @@ from jaxeit.toml import TomlTable, parse_toml
 from ...fitting.cross_validation.selection import Candidate, Choice
 from ...fitting.curves import CURVES, AbstractCurve, FittedCurve, Linear
 from ...fitting.fields import FIELDS, AbstractField, FittedField, Geometry
-from ...fitting.fields.base import restored
+from ...fitting.fields.base import restore_field
 from ...fitting.intervals import NoiseLaw
 from ...presses.crosstalk import Crosstalk
 from ...presses.table import Processing
@@ -307,7 +307,7 @@ def field_from(arrays: Mapping[str, np.ndarray], kind: type[AbstractField]) -> F
     # early versions did not store these
     given = {"location/effective": np.asarray(np.nan), "location/error_scale": np.ones(()), **arrays}
     numbers = {name: jax.device_put(given[f"location/{name}"]) for name in _FIELD_FIELDS}
-    return FittedField(field=restored(kind, choice), geometry=Geometry(**geometry), **numbers)
+    return FittedField(field=restore_field(kind, choice), geometry=Geometry(**geometry), **numbers)
 
 
 def _location_from(arrays: Mapping[str, np.ndarray], name: str, dtype: Any) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ...fitting.gain_update import DETERMINED_RATIO, GainDrift
+from ...fitting.gain_update import MAX_DETERMINED_RATIO, GainDrift
 from ...fitting.logs import LogModel, LogPrediction
 from ..recalibration.changes import (
     LARGE_MISFIT,
@@ -217,7 +217,7 @@ def fit_shift(
     gain, offset = mean + found * unit
     remains = read - gain * force - offset
     misfit, scatter = (float(np.sqrt(np.mean(size**2))) for size in (remains / deviation, remains))
-    determined = bool(posterior[0, 0] < DETERMINED_RATIO**2 * covariance[0, 0])
+    determined = bool(posterior[0, 0] < MAX_DETERMINED_RATIO**2 * covariance[0, 0])
     return ShiftFit(np.array([gain, offset]), (posterior + posterior.T) / 2, determined, misfit, scatter)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ...fitting.gain_update import relative
+from ...fitting.gain_update import relative_covariance
 from ...fitting.pad_gains import PadGains
 
 NOTICEABLE_CHANGE = 0.02  # change of a gain below which a recalibration is not worth it
@@ -113,7 +113,7 @@ class Recalibration:
     def change_error(self) -> np.ndarray:
         """Standard error (pads,) of `change`; without known force, of the change relative to the other pads."""
         known = self.evidence is Evidence.KNOWN_FORCE
-        return np.asarray(np.sqrt(np.diag(self.covariance if known else relative(self.covariance))))
+        return np.asarray(np.sqrt(np.diag(self.covariance if known else relative_covariance(self.covariance))))
 
     @property
     def significant(self) -> np.ndarray:

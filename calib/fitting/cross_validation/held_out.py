@@ -1,4 +1,4 @@
-"""Forces predicted by fits that did not use the press: one place, pad, indenter or session is left out at a time.
+"""Cross-validation: forces predicted by fits without the place, pad, indenter or session of the press.
 
 Cross-validation over places gives the error of presses between known places. The other splits give the error of
 extrapolation: to a pad that was never pressed, another tip, another day. Intervals come from a bootstrap over places:
@@ -22,11 +22,11 @@ from ..fields.base import AbstractField
 from ..fields.fitted import FittedField
 from ..intervals import COVERAGE, NoiseLaw, fit_noise
 from ..losses import AbstractLoss
-from ..pads import LocatedPresses, PadForces, PadModel, along_presses, fit_pads, over_holds
+from ..pads import LocatedPresses, PadForces, PadModel, fit_pads, predict_holds, predict_samples
 from ..results import FitResult
 from .scores import assign_folds
 
-DRAWS = 2000  # draws of the bootstrap; the ends of an interval then vary by about 2 % of its length
+BOOTSTRAP_DRAWS = 2000  # with these the ends of a 90 % range vary by about 2 % of its length
 
 
 class Split(NamedTuple):
@@ -54,15 +54,15 @@ class Split(NamedTuple):
 
 
 def place_draws(place: np.ndarray) -> np.ndarray:
-    """How often each press is drawn, (draws, presses), when places are drawn with replacement. Fixed seed."""
+    """Counts of each press in bootstrap samples of places, (draws, presses), with a fixed seed."""
     _, first, index = np.unique(place, return_index=True, return_inverse=True)
     number = np.argsort(np.argsort(first))[index.ravel()]  # of each place, in the order of appearance
     count = len(first)
-    drawn = np.random.default_rng(0).integers(count, size=(DRAWS, count))
-    return np.stack([np.bincount(draw, minlength=count) for draw in drawn])[:, number]
+    draws = np.random.default_rng(0).integers(count, size=(BOOTSTRAP_DRAWS, count))
+    return np.stack([np.bincount(draw, minlength=count) for draw in draws])[:, number]
 
 
-def interval(draws: np.ndarray) -> tuple[float, float]:
+def bootstrap_interval(draws: np.ndarray) -> tuple[float, float]:
     """Ends of the 90 % interval of the draws of a statistic."""
     low, high = np.quantile(draws, [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2])
     return float(low), float(high)
@@ -133,47 +133,47 @@ class Folds:
         self._fits: dict[tuple[int, int, frozenset[int]], tuple[PadModel, object]] = {}
 
     @property
-    def numbers(self) -> list[int]:
-        """The numbers of the folds."""
-        found: list[int] = np.unique(self.fold).tolist()
-        return found
+    def indices(self) -> list[int]:
+        """Indices of the folds."""
+        indices: list[int] = np.unique(self.fold).tolist()
+        return indices
 
-    def _within(self, folds: frozenset[int]) -> np.ndarray:
+    def _in_folds(self, folds: frozenset[int]) -> np.ndarray:
         return np.isin(self.fold, list(folds))
 
     def fit(self, curve: AbstractCurve, field: AbstractField | None, without: frozenset[int]) -> PadModel:
         """The fit of curve and field to the presses of all folds but these."""
         key = id(curve), id(field), without
         if key not in self._fits:
-            model = fit_pads(curve, field, self.presses, self.loss, use=~self._within(without))
+            model = fit_pads(curve, field, self.presses, self.loss, use=~self._in_folds(without))
             self._fits[key] = model, (curve, field)  # the choices are kept too, so that no other takes their id
         return self._fits[key][0]
 
-    def predicted(self, model: PadModel, within: frozenset[int]) -> HeldOut:
+    def predict(self, model: PadModel, within: frozenset[int]) -> HeldOut:
         """Forces of the presses of these folds; NaN for the others."""
-        held, data = self._within(within), self.presses.data
-        out = HeldOut(_nothing(data.pressure.shape), _nothing(data.sample_pressure.T.shape), self.fold)
-        _fill(out.hold, over_holds(model, self.presses), held)
-        _fill(out.along, along_presses(model, self.presses), held[data.sample_press])
+        held, data = self._in_folds(within), self.presses.data
+        out = HeldOut(_empty_forces(data.pressure.shape), _empty_forces(data.sample_pressure.T.shape), self.fold)
+        _fill(out.hold, predict_holds(model, self.presses), held)
+        _fill(out.along, predict_samples(model, self.presses), held[data.sample_press])
         return out
 
     def hold_out(
         self, curve: AbstractCurve, field: AbstractField | None, without: frozenset[int] = frozenset()
     ) -> HeldOut:
         """Pad forces of every press by fits without its fold and without the folds `without`; NaN for the latter."""
-        left = [frozenset({k}) for k in self.numbers if k not in without]
-        return joined([self.predicted(self.fit(curve, field, one | without), one) for one in left], self)
+        singles = [frozenset({k}) for k in self.indices if k not in without]
+        return join_folds([self.predict(self.fit(curve, field, fold | without), fold) for fold in singles], self)
 
     def place_errors(
         self, curve: AbstractCurve, field: AbstractField | None, without: frozenset[int] = frozenset()
     ) -> np.ndarray:
         """Mean square error of the total force at each place, (places,) N^2, by fits without the fold of the place.
 
-        Places in the folds `without` are left out. NaN at all places if a fit fails: its numbers must not be compared
+        Places in the folds `without` are left out. NaN at all places if a fit fails: its errors must not be compared
         with those of others.
         """
         data, held = self.presses.data, self.hold_out(curve, field, without)
-        kept = ~self._within(without)
+        kept = ~self._in_folds(without)
         if not np.isfinite(held.hold.force[kept]).all():
             return np.full(len(np.unique(data.place[kept])), np.nan)
         square = (held.along.force.sum(1) - data.sample_force) ** 2
@@ -183,23 +183,23 @@ class Folds:
         return np.bincount(place, square[rows]) / count
 
 
-def joined(parts: Sequence[HeldOut], folds: Folds) -> HeldOut:
+def join_folds(parts: Sequence[HeldOut], folds: Folds) -> HeldOut:
     """Predictions of several folds as one."""
     data = folds.presses.data
-    out = HeldOut(_nothing(data.pressure.shape), _nothing(data.sample_pressure.T.shape), folds.fold)
+    out = HeldOut(_empty_forces(data.pressure.shape), _empty_forces(data.sample_pressure.T.shape), folds.fold)
     for part in parts:
-        for mine, theirs in ((out.hold, part.hold), (out.along, part.along)):
-            _fill(mine, theirs, np.isfinite(theirs.force).any(1))
+        for target, source in ((out.hold, part.hold), (out.along, part.along)):
+            _fill(target, source, np.isfinite(source.force).any(1))
     return out
 
 
-def _nothing(shape: tuple[int, ...]) -> PadForces:
+def _empty_forces(shape: tuple[int, ...]) -> PadForces:
     return PadForces(np.full(shape, np.nan), np.full(shape[0], np.nan))
 
 
-def _fill(out: PadForces, found: PadForces, rows: np.ndarray) -> None:
-    for mine, theirs in zip(out, found, strict=True):
-        mine[rows] = theirs[rows]
+def _fill(out: PadForces, source: PadForces, rows: np.ndarray) -> None:
+    for target, values in zip(out, source, strict=True):
+        target[rows] = values[rows]
 
 
 def hold_out_image(image_sum: np.ndarray, force: np.ndarray, fold: np.ndarray) -> np.ndarray:
@@ -212,7 +212,7 @@ def hold_out_image(image_sum: np.ndarray, force: np.ndarray, fold: np.ndarray) -
     return out
 
 
-def leave_out(
+def leave_groups_out(
     curve: AbstractCurve,
     field: AbstractField | None,
     presses: LocatedPresses,
@@ -226,19 +226,21 @@ def leave_out(
             A left-out "pad" is predicted by one curve of all other pads, and by the field that it shares with them.
     """
     return tuple(
-        _split(by, part, presses, partial(_by_other_pads if by == "pad" else fit_pads, curve, field, presses, loss))
+        _leave_out(
+            by, part, presses, partial(_fit_with_other_pads if by == "pad" else fit_pads, curve, field, presses, loss)
+        )
         for by, part in groups.items()
     )
 
 
-def _split(by: str, part: np.ndarray, presses: LocatedPresses, fit: Callable[..., PadModel]) -> Split:
+def _leave_out(by: str, part: np.ndarray, presses: LocatedPresses, fit: Callable[..., PadModel]) -> Split:
     data, parts = presses.data, np.unique(part[part >= 0])
     if len(parts) < 2:
         return Split(by, len(parts), note=f"the presses are of one {by} only: record presses of another too")
     error = np.full(len(data.force), np.nan)
     for k in parts:
         held = part == k
-        force = over_holds(fit(use=~held), presses).force
+        force = predict_holds(fit(use=~held), presses).force
         error[held] = (force.sum(1) - data.force)[held]
     if not np.isfinite(error[part >= 0]).all():
         return Split(by, len(parts), note=f"without one {by} the rest does not determine the fit: record more presses")
@@ -246,15 +248,17 @@ def _split(by: str, part: np.ndarray, presses: LocatedPresses, fit: Callable[...
 
 
 def _errors(by: str, error: np.ndarray, part: np.ndarray, place: np.ndarray) -> Split:
-    seen = part >= 0
-    square, part = error[seen] ** 2, part[seen]
-    weight = place_draws(place[seen])
+    predicted_rows = part >= 0
+    square, part = error[predicted_rows] ** 2, part[predicted_rows]
+    weight = place_draws(place[predicted_rows])
     draws = np.sqrt(weight @ square / weight.sum(1))
     worst = max(np.sqrt(square[part == k].mean()) for k in np.unique(part))
-    return Split(by, len(np.unique(part)), len(square), float(np.sqrt(square.mean())), *interval(draws), float(worst))
+    return Split(
+        by, len(np.unique(part)), len(square), float(np.sqrt(square.mean())), *bootstrap_interval(draws), float(worst)
+    )
 
 
-def _by_other_pads(
+def _fit_with_other_pads(
     curve: AbstractCurve,
     field: AbstractField | None,
     presses: LocatedPresses,
@@ -267,29 +271,29 @@ def _by_other_pads(
     empty = np.flatnonzero(~(use[:, None] & (data.share >= DOMINANT_SHARE)).any(0))
     use = use & (data.share[:, empty] < MIN_SHARE).all(1)
     found = fit_pads(curve, field, presses, loss, use=use)
-    mine = data.mask & (use[:, None] & (data.share >= DOMINANT_SHARE))[data.sample_press].T
+    dominant = data.mask & (use[:, None] & (data.share >= DOMINANT_SHARE))[data.sample_press].T
     gain = 0.0 if found.field is None or places is None else found.log_gains(places)[data.sample_press].T
-    together = fit_curves(
+    pooled = fit_curves(
         curve,
-        np.where(mine, data.sample_pressure, 0).sum(0)[None],
-        data.sample_force * np.exp(-np.where(mine, gain, 0).sum(0)),
-        mask=mine.any(0),
+        np.where(dominant, data.sample_pressure, 0).sum(0)[None],
+        data.sample_force * np.exp(-np.where(dominant, gain, 0).sum(0)),
+        mask=dominant.any(0),
         groups=data.sample_place,
         loss=loss,
     )
-    if not len(empty) or int(together.result[0]) != FitResult.SUCCESS:
+    if not len(empty) or int(pooled.result[0]) != FitResult.SUCCESS:
         return found
 
-    def filled(pads: jax.Array, one: jax.Array) -> np.ndarray:
-        every = np.array(pads)
-        every[empty] = np.asarray(one)[0]
-        return every
+    def replace_empty(pads: jax.Array, common: jax.Array) -> np.ndarray:
+        values = np.array(pads)
+        values[empty] = np.asarray(common)[0]
+        return values
 
-    curves = jax.device_put(jax.tree.map(filled, found.curves, together))
-    return replace(found, curves=curves, field=_levelled(found.field, empty))
+    curves = jax.device_put(jax.tree.map(replace_empty, found.curves, pooled))
+    return replace(found, curves=curves, field=_with_mean_features(found.field, empty))
 
 
-def _levelled(field: FittedField | None, empty: np.ndarray) -> FittedField | None:
+def _with_mean_features(field: FittedField | None, empty: np.ndarray) -> FittedField | None:
     """The field, with the mean features of the other pads taken for the `empty` pads, which have no presses."""
     if field is None:
         return None

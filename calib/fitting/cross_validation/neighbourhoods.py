@@ -1,4 +1,4 @@
-"""How far the errors of a field go beyond what its covariance states, by presses held out with their neighbourhoods.
+"""Calibration of the standard errors of a field, by presses held out with their neighbourhoods.
 
 Presses on a grid that is aligned with the walls have few distances to walls. A field of these distances then predicts a
 held-out press from others of the same distances: its error says nothing of the places between the distances, where
@@ -18,20 +18,20 @@ from ..curves.samples import by_rows
 from ..fields.base import AbstractField
 from ..fields.fitted import FittedField, centred_features
 from ..fields.places import Places
-from ..intervals import NORMAL_MULTIPLE, NoiseLaw, most_likely_sizes
+from ..intervals import NORMAL_MULTIPLE, NoiseLaw, fit_variance_components
 from ..pads import PadModel
-from .held_out import Folds, HeldOut, joined
+from .held_out import Folds, HeldOut, join_folds
 from .scores import assign_folds
 
-# Correlation between the fields at two places, by the prior, above which the places are of one neighbourhood: each then
-# explains half of the variance of the other.
-ALIKE = np.sqrt(0.5)
-# Most fits without a neighbourhood; of more neighbourhoods, several are held out together.
-MOST_FITS = 12
+# Least correlation of the fields at two places of one neighbourhood, by the prior: each place then explains half of the
+# variance of the other.
+MIN_CORRELATION = np.sqrt(0.5)
+# Largest number of fits without a neighbourhood; of more neighbourhoods, several are held out together.
+MAX_FITS = 12
 
 
 def field_neighbourhoods(fitted: FittedField, places: Places, share: np.ndarray) -> np.ndarray:
-    """Number of the neighbourhood of each press, (presses,): the fields of any two presses of one are alike.
+    """Number of the neighbourhood of each press, (presses,): the fields of any two presses of one are correlated.
 
     Args:
         places: of the presses.
@@ -44,8 +44,8 @@ def field_neighbourhoods(fitted: FittedField, places: Places, share: np.ndarray)
     rows = rows * np.sqrt(shapes.mean(0))
     length = np.linalg.norm(rows, axis=1, keepdims=True)
     unit = rows / np.where(length > 0, length, 1)
-    found = fcluster(linkage(unit, "complete"), np.sqrt(2 - 2 * ALIKE), "distance")
-    return np.asarray(found)
+    cluster = fcluster(linkage(unit, "complete"), np.sqrt(2 - 2 * MIN_CORRELATION), "distance")
+    return np.asarray(cluster)
 
 
 def error_scale(folds: Folds, curve: AbstractCurve, model: PadModel, noise: NoiseLaw) -> float:
@@ -66,20 +66,22 @@ def error_scale(folds: Folds, curve: AbstractCurve, model: PadModel, noise: Nois
     count = len(np.unique(group))
     if count < 2:
         return 1.0
-    apart = Folds(presses, folds.loss, assign_folds(group, min(MOST_FITS, count)))
-    return _likeliest(apart, curve, model.field.field, noise, group)
+    grouped = Folds(presses, folds.loss, assign_folds(group, min(MAX_FITS, count)))
+    return _fit_error_scale(grouped, curve, model.field.field, noise, group)
 
 
-def _likeliest(folds: Folds, curve: AbstractCurve, field: AbstractField, noise: NoiseLaw, group: np.ndarray) -> float:
+def _fit_error_scale(
+    folds: Folds, curve: AbstractCurve, field: AbstractField, noise: NoiseLaw, group: np.ndarray
+) -> float:
     """The factor of largest normal likelihood; a neighbourhood counts as one, because its presses err together."""
     data, held = folds.presses.data, folds.hold_out(curve, field)
     force, stated = held.hold
     residual, known = data.force - force.sum(1), np.asarray(noise.variance(jnp.asarray(force))).sum(1)
-    sound = np.isfinite(residual) & np.isfinite(known) & np.isfinite(stated)
-    if not sound.any():
+    finite = np.isfinite(residual) & np.isfinite(known) & np.isfinite(stated)
+    if not finite.any():
         return 1.0
-    _, number, count = np.unique(group[sound], return_inverse=True, return_counts=True)
-    found = most_likely_sizes(residual[sound], known[sound], 1 / count[number], stated[sound, None])
+    _, number, count = np.unique(group[finite], return_inverse=True, return_counts=True)
+    found = fit_variance_components(residual[finite], known[finite], 1 / count[number], stated[finite, None])
     return max(1.0, float(found[0]) * NORMAL_MULTIPLE / float(noise.multiple))
 
 
@@ -87,12 +89,12 @@ def with_error_scale(model: PadModel, scale: float) -> PadModel:
     """The model, the standard errors of whose field are multiplied by `scale`; itself without a field."""
     if model.field is None:
         return model
-    known = jnp.asarray(scale, model.field.noise.dtype)
-    found: PadModel = eqx.tree_at(lambda m: m.field.error_scale, model, known)
+    factor = jnp.asarray(scale, model.field.noise.dtype)
+    found: PadModel = eqx.tree_at(lambda m: m.field.error_scale, model, factor)
     return found
 
 
 def hold_out_scaled(folds: Folds, models: Mapping[int, PadModel], scale: float) -> HeldOut:
     """Predictions of every fold by the model without it, the errors of whose field are multiplied by `scale`."""
-    parts = [folds.predicted(with_error_scale(model, scale), frozenset({k})) for k, model in models.items()]
-    return joined(parts, folds)
+    parts = [folds.predict(with_error_scale(model, scale), frozenset({k})) for k, model in models.items()]
+    return join_folds(parts, folds)

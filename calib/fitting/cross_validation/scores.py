@@ -77,7 +77,7 @@ def assign_folds(groups: Numbers, folds: int = 5, seed: int = 0) -> np.ndarray:
     return (order % folds)[index.reshape(-1)]
 
 
-def trusted_forces(fitted: FittedCurve, pressures: np.ndarray) -> np.ndarray:
+def valid_forces(fitted: FittedCurve, pressures: np.ndarray) -> np.ndarray:
     """Forces (pads, n) N by fits that succeeded, NaN by those that did not."""
     force = predict_pads(fitted, jnp.asarray(pressures, fitted.parameters.dtype)).force
     good = np.asarray(fitted.result) == FitResult.SUCCESS

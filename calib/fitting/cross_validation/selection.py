@@ -17,8 +17,8 @@ from ..fields import FIELDS, AbstractField
 from ..pads import PadModel
 from .held_out import Folds
 
-MAX_SAID = 12  # candidates that the reason in words names; the table of the report has all
-NOTHING_HELD: frozenset[int] = frozenset()
+MAX_LISTED = 12  # candidates in the reason in words; the table of the report has all
+NO_FOLDS: frozenset[int] = frozenset()
 
 
 class Candidate(NamedTuple):
@@ -44,7 +44,7 @@ class Candidate(NamedTuple):
     chosen: bool
 
 
-class Tried(NamedTuple):
+class Option(NamedTuple):
     """A candidate with its name and number of effective coefficients."""
 
     choice: Any
@@ -53,43 +53,41 @@ class Tried(NamedTuple):
 
 
 def simplest(
-    part: str, tried: Sequence[Tried], score: Callable[[Any], np.ndarray], over: str
+    part: str, options: Sequence[Option], score: Callable[[Any], np.ndarray], over: str
 ) -> tuple[Any, str, tuple[Candidate, ...]]:
     """The smallest candidate that is not worse than the best by more than the standard error of their difference.
 
     Args:
         part: what is chosen; see `Candidate`.
-        tried: the candidates; a single one is not scored.
+        options: the candidates; a single one is not scored.
         score: mean square errors of a `choice`, (n,) N^2 over places; a value that is not finite: not determined.
         over: what n counts, in words.
 
     Returns: the choice, the reason in words, and all candidates (none if there was only one).
     """
-    if len(tried) == 1:
-        return tried[0].choice, "", ()
-    tried = sorted(tried, key=lambda one: one.size)
-    errors = [score(one.choice) for one in tried]
+    if len(options) == 1:
+        return options[0].choice, "", ()
+    options = sorted(options, key=lambda option: option.size)
+    errors = [score(option.choice) for option in options]
     means = np.array([np.mean(e) if np.isfinite(e).all() else np.inf for e in errors])
     least = int(np.argmin(means))
     spread = np.array([_standard_error(e - errors[least]) for e in errors])
     chosen = int(np.argmax(means <= means[least] + np.nan_to_num(spread)))
     table = tuple(
-        Candidate(part, one.name, round(one.size, 1), *_roots(mean, error), chosen=k == chosen)
-        for k, (one, mean, error) in enumerate(zip(tried, means, spread, strict=True))
+        Candidate(part, option.name, round(option.size, 1), *_root_mean_squares(mean, error), chosen=k == chosen)
+        for k, (option, mean, error) in enumerate(zip(options, means, spread, strict=True))
     )
-    said = ", ".join(
-        f"{c.name} {'not determined' if c.rmse is None else f'{c.rmse:.2f}'}" for c in _worth_saying(table)
-    )
-    said += f" and {len(table) - MAX_SAID} more" if len(table) > MAX_SAID else ""
-    why = f"{tried[chosen].name}, the simplest within one standard error of the paired difference from the best"
-    return tried[chosen].choice, f"{why} ({tried[least].name}); held-out RMSE over {over} in N: {said}", table
+    listed = ", ".join(f"{c.name} {'not determined' if c.rmse is None else f'{c.rmse:.2f}'}" for c in _listed(table))
+    listed += f" and {len(table) - MAX_LISTED} more" if len(table) > MAX_LISTED else ""
+    why = f"{options[chosen].name}, the simplest within one standard error of the paired difference from the best"
+    return options[chosen].choice, f"{why} ({options[least].name}); held-out RMSE over {over} in N: {listed}", table
 
 
-def _worth_saying(table: Sequence[Candidate]) -> list[Candidate]:
+def _listed(table: Sequence[Candidate]) -> list[Candidate]:
     """All candidates, or the best few of many."""
-    if len(table) <= MAX_SAID:
+    if len(table) <= MAX_LISTED:
         return list(table)
-    return sorted(table, key=lambda c: np.inf if c.rmse is None else c.rmse)[:MAX_SAID]
+    return sorted(table, key=lambda c: np.inf if c.rmse is None else c.rmse)[:MAX_LISTED]
 
 
 def _standard_error(difference: np.ndarray) -> float:
@@ -98,7 +96,7 @@ def _standard_error(difference: np.ndarray) -> float:
     return float(np.std(difference, ddof=1) / np.sqrt(len(difference)))
 
 
-def _roots(mean: float, error: float) -> tuple[float | None, float | None, float | None]:
+def _root_mean_squares(mean: float, error: float) -> tuple[float | None, float | None, float | None]:
     """Roots (N) of a mean square (N^2), and of it minus and plus its standard error."""
     if not np.isfinite(mean):
         return None, None, None
@@ -133,7 +131,7 @@ def choose(
     curves: Sequence[AbstractCurve],
     fields: Sequence[AbstractField | None],
     folds: Folds,
-    without: frozenset[int] = NOTHING_HELD,
+    without: frozenset[int] = NO_FOLDS,
 ) -> Choice:
     """The simplest pair of curve and field whose held-out error is not worse than the least; see `simplest`.
 
@@ -147,19 +145,19 @@ def choose(
     if len(pairs) == 1:
         return Choice(*pairs[0], "")
     parts = [part for part, choices in (("curve", curves), ("location", fields)) if len(choices) > 1]
-    tried = [Tried(pair, _name(*pair, parts), folds.fit(*pair, without).coefficients) for pair in pairs]
+    options = [Option(pair, _name(*pair, parts), folds.fit(*pair, without).coefficients) for pair in pairs]
     (curve, field), why, table = simplest(
-        " and ".join(parts), tried, lambda pair: folds.place_errors(pair[0], pair[1], without), "places"
+        " and ".join(parts), options, lambda pair: folds.place_errors(pair[0], pair[1], without), "places"
     )
     return Choice(curve, field, why, table)
 
 
-def chosen_without(
+def nested_selection(
     curves: Sequence[AbstractCurve], fields: Sequence[AbstractField | None], folds: Folds
 ) -> dict[int, PadModel]:
     """The fit without each fold, by its number; curve and field are chosen without the fold as well (nested)."""
-    found = {}
-    for k in folds.numbers:
+    models = {}
+    for k in folds.indices:
         choice = choose(curves, fields, folds, frozenset({k}))
-        found[k] = folds.fit(choice.curve, choice.field, frozenset({k}))
-    return found
+        models[k] = folds.fit(choice.curve, choice.field, frozenset({k}))
+    return models

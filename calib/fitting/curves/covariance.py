@@ -10,10 +10,10 @@ from jaxeit.linalg.lapack import eigh, svd
 
 from .problem import CurveProblem, residuals
 
-# Leverage of one press in a direction above which the press alone determines it; CR2 divides by the rest.
+# Largest leverage of one press in a direction; above it the press alone determines it, and CR2 divides by the rest.
 MAX_LEVERAGE = 1 - 1e-3
 # Least mean derivative of the influence in any direction; below it nearly all samples there are outliers.
-MIN_STEEPNESS = 0.05
+MIN_CURVATURE = 0.05
 
 
 def independent_covariance(
@@ -41,12 +41,12 @@ def cluster_covariance(
     score = jax.ops.segment_sum(left * psi[:, None], group, n_groups)
     leverage = jax.ops.segment_sum(left[:, :, None] * left[:, None, :], group, n_groups)
     values, vectors = jax.vmap(eigh)(leverage)
-    decided = values > MAX_LEVERAGE
+    degenerate = values > MAX_LEVERAGE
     root = jax.lax.rsqrt(1 - values)
     adjusted = jnp.einsum("gij,gj,gkj,gk->gi", vectors, root, vectors, score)
-    steepness, axes = eigh(left.T @ (left * dpsi[:, None]))
-    bread = axes / steepness @ axes.T
-    enough = ~jnp.any(decided) & (steepness[0] > MIN_STEEPNESS)
+    curvature, axes = eigh(left.T @ (left * dpsi[:, None]))
+    bread = axes / curvature @ axes.T
+    enough = ~jnp.any(degenerate) & (curvature[0] > MIN_CURVATURE)
     return bread @ adjusted.T @ adjusted @ bread, enough
 
 
@@ -72,31 +72,31 @@ class CurveMinimum(NamedTuple):
     | free        | free parameters                                     | (k,)  |
     | spread      | scale of the residuals                              | ()    |
     | bend_weight | weight of the roughness penalty                     | ()    |
-    | vanished    | slopes and exponents that are on their lower bound  | (k,)  |
+    | at_bound    | slopes and exponents that are on their lower bound  | (k,)  |
     """
 
     free: Float[Array, " k"]
     spread: Float[Array, ""]
     bend_weight: Float[Array, ""]
-    vanished: Bool[Array, " k"]
+    at_bound: Bool[Array, " k"]
 
 
 class CurveCovariance(NamedTuple):
     """Covariance of the parameters, and what it rests on.
 
-    | field      | meaning                                                                              | shape  |
-    |------------|--------------------------------------------------------------------------------------|--------|
-    | covariance | of the parameters, in their units                                                    | (k, k) |
-    | rank       | number of directions that the samples determine                                      | ()     |
-    | enough     | whether there are enough groups                                                      | ()     |
-    | missed     | share of the residuals' influence that slopes below zero would explain; 0 if none is | ()     |
-    |            | on its bound                                                                         |        |
+    | field         | meaning                                                                           | shape  |
+    |---------------|-----------------------------------------------------------------------------------|--------|
+    | covariance    | of the parameters, in their units                                                 | (k, k) |
+    | rank          | number of directions that the samples determine                                   | ()     |
+    | enough        | whether there are enough groups                                                   | ()     |
+    | contradiction | share of the residuals' influence that slopes below zero would explain; 0 if none | ()     |
+    |               | is on its bound                                                                   |        |
     """
 
     covariance: Float[Array, "k k"]
     rank: Int[Array, ""]
     enough: Bool[Array, ""]
-    missed: Float[Array, ""]
+    contradiction: Float[Array, ""]
 
 
 def covariance_at(end: CurveMinimum, problem: CurveProblem) -> CurveCovariance:
@@ -120,8 +120,8 @@ def covariance_at(end: CurveMinimum, problem: CurveProblem) -> CurveCovariance:
     units = jax.jacfwd(curve.bound)(end.free, scale) * unit @ (right.T / singular)
     bends = end.bend_weight * problem.bends
     push = psi @ jacobian
-    wanted = jnp.minimum(push, push + bends.T @ (bends @ (1 / unit)))
-    less = jnp.where(end.vanished, jnp.maximum(wanted, 0), 0)
+    gradient = jnp.minimum(push, push + bends.T @ (bends @ (1 / unit)))
+    multiplier = jnp.where(end.at_bound, jnp.maximum(gradient, 0), 0)
     _, size, axes = thin_svd(jnp.concatenate([jacobian, bends])) if len(bends) else (left, singular, right)
-    missed = jnp.sum(jnp.where(size > tiny, axes @ less / size, 0) ** 2) / jnp.sum(psi**2)
-    return CurveCovariance(units @ inner @ units.T, jnp.sum(singular > tiny), enough, missed)
+    contradiction = jnp.sum(jnp.where(size > tiny, axes @ multiplier / size, 0) ** 2) / jnp.sum(psi**2)
+    return CurveCovariance(units @ inner @ units.T, jnp.sum(singular > tiny), enough, contradiction)

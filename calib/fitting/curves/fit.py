@@ -4,7 +4,7 @@ For residuals r_i = (F_i - h(P_i)) / (sigma_i s), s a robust scale, the fit mini
 (an M-estimate of width w). `optimistix.least_squares` gets the residuals transformed to
 sign(r) w sqrt(rho(r^2 / w^2)), whose squares are the loss: every least-squares solver can minimise it, without a
 reweighting loop. The default solver also uses the curvature of the loss and needs fewer steps. The scale s is 1.4826
-times the median absolute residual (MAD); it is estimated at the start of each of a few rounds and held within it.
+times the median absolute residual (MAD); it is estimated at the start of each of a few iterations and held within it.
 
 Slopes and exponents are positive. The solver's unknowns are their multiples of the start, with a lower bound that
 stands for zero, because the logarithm of a slope that tends to zero diverges. Where the samples favour a slope at or
@@ -41,18 +41,18 @@ from ..results import FitError, FitResult
 from .base import AbstractCurve, scale_of
 from .covariance import CurveCovariance, CurveMinimum, covariance_at
 from .fitted import FittedCurve
-from .own_curves import Trial, is_own, require_sound, trial
+from .own_curves import StartValues, evaluate_start, is_own, require_rising
 from .problem import CurveProblem
-from .samples import Numbers, Samples, bucket, gather
+from .samples import Numbers, Samples, bucket, make_samples
 
 Solver = optx.AbstractLeastSquaresSolver[Any, Any, Any, Any]
 Flag = Bool[Array, ""] | bool
 
-# Rounds of minimisation: each estimates the scale of the residuals where the one before ended.
-ROUNDS = 4
-# Relative precision of all rounds but the last, which only serve to find the scale of the residuals.
-ROUND_PRECISION = 1e-4
-# Part of the residuals' influence that slopes below zero may explain; beyond it the samples contradict a rising curve.
+# Number of minimisations: each estimates the scale of the residuals where the one before ended.
+ITERATIONS = 4
+# Relative tolerance of all minimisations but the last, which only serve to estimate the scale of the residuals.
+INNER_RTOL = 1e-4
+# Largest share of the residuals' influence that slopes below zero would explain; above it samples contradict the curve.
 MAX_CONTRADICTION = 0.25
 # Least rise of the curve over the fitted pressures, as a fraction of the typical force.
 MIN_RISE = 1e-3
@@ -64,22 +64,24 @@ def default_solver(dtype: DTypeLike) -> LevenbergMarquardt:
     return LevenbergMarquardt(tolerance, tolerance)
 
 
-def _solve(problem: CurveProblem, solver: Solver, max_steps: int, rounds: int) -> tuple[CurveMinimum, Bool[Array, ""]]:
-    """The minimum after `rounds` rounds, and whether the last round converged."""
+def _solve(
+    problem: CurveProblem, solver: Solver, max_steps: int, iterations: int
+) -> tuple[CurveMinimum, Bool[Array, ""]]:
+    """The minimum after `iterations` iterations, and whether the last iteration converged."""
     dtype = problem.start.dtype
-    slack = jnp.ones(rounds, dtype).at[:-1].set(max(ROUND_PRECISION / solver.rtol, 1.0))
-    # No penalty in the first round, whose residuals show the error of the start rather than that of the samples.
-    bent = jnp.ones(rounds, dtype).at[0].set(0)
+    slack = jnp.ones(iterations, dtype).at[:-1].set(max(INNER_RTOL / solver.rtol, 1.0))
+    # No penalty in the first iteration, whose residuals show the error of the start rather than that of the samples.
+    penalty = jnp.ones(iterations, dtype).at[0].set(0)
     options = {"lower": problem.lower, "curvature": problem.curvature}
 
-    def one_round(multiple: Array, settings: tuple[Array, Array]) -> tuple[Array, tuple[Array, ...]]:
-        slack, bent = settings
-        weights = problem.weights(multiple, bent)
+    def iterate(multiple: Array, settings: tuple[Array, Array]) -> tuple[Array, tuple[Array, ...]]:
+        slack, penalty = settings
+        weights = problem.weights(multiple, penalty)
         tolerances = (solver.rtol * slack, solver.atol * slack)
-        looser = eqx.tree_at(lambda s: (s.rtol, s.atol), solver, tolerances)
+        inner_solver = eqx.tree_at(lambda s: (s.rtol, s.atol), solver, tolerances)
         solution: Any = optx.least_squares(
             lambda multiple, args: args[0].objective(multiple, *args[1]),
-            looser,
+            inner_solver,
             multiple,
             (problem, weights),
             options,
@@ -89,8 +91,8 @@ def _solve(problem: CurveProblem, solver: Solver, max_steps: int, rounds: int) -
         )
         return solution.value, (*weights, solution.result == optx.RESULTS.successful)
 
-    multiple, (spread, weight, ended) = jax.lax.scan(one_round, problem.first, (slack, bent))
-    return CurveMinimum(problem.free(multiple), spread[-1], weight[-1], problem.vanished(multiple)), ended[-1]
+    multiple, (spread, weight, ended) = jax.lax.scan(iterate, problem.first, (slack, penalty))
+    return CurveMinimum(problem.free(multiple), spread[-1], weight[-1], problem.at_bound(multiple)), ended[-1]
 
 
 def _groups_used(samples: Samples, n_groups: int) -> Int[Array, ""]:
@@ -100,7 +102,7 @@ def _groups_used(samples: Samples, n_groups: int) -> Int[Array, ""]:
     return jnp.sum(counts > 0)
 
 
-def held_pressure(pressure: Float[Array, " n"], present: Bool[Array, " n"]) -> Float[Array, " n"]:
+def fill_gaps(pressure: Float[Array, " n"], present: Bool[Array, " n"]) -> Float[Array, " n"]:
     """Pressures (n,) Pa for a curve with memory: the last pressure before a gap fills it, 0 a gap at the start."""
     last = jax.lax.cummax(jnp.where(present, jnp.arange(len(pressure)), -1))
     return jnp.where(last >= 0, jnp.where(present, pressure, 0.0)[last], 0.0)
@@ -113,7 +115,9 @@ def _pressure_range(samples: Samples) -> Float[Array, "2"]:
     return jnp.stack([low, high])
 
 
-def _judge(finite: Flag, enough: Flag, ended: Flag, rises: Flag, determined: Flag, inside: Flag) -> Int[Array, ""]:
+def _result_code(
+    finite: Flag, enough: Flag, ended: Flag, rises: Flag, determined: Flag, inside: Flag
+) -> Int[Array, ""]:
     """The code of the first check that failed, in the order below; SUCCESS if none did."""
     checks = [
         (finite, FitResult.NOT_FINITE),
@@ -128,7 +132,7 @@ def _judge(finite: Flag, enough: Flag, ended: Flag, rises: Flag, determined: Fla
 
 
 class _Fit(NamedTuple):
-    """What one pad's fit works on: the samples used, the problem made of them, and which samples are finite."""
+    """The fit of one pad: the samples used, their problem, and flags of the finite samples."""
 
     used: Samples
     problem: CurveProblem
@@ -140,7 +144,7 @@ def _prepare(curve: AbstractCurve, samples: Samples, loss: AbstractLoss, n_group
     present = jnp.isfinite(samples.pressure) & jnp.isfinite(samples.force)
     valid = samples.valid & present
     used = Samples(
-        held_pressure(samples.pressure, present) if curve.path else jnp.where(valid, samples.pressure, 0.0),
+        fill_gaps(samples.pressure, present) if curve.path else jnp.where(valid, samples.pressure, 0.0),
         jnp.where(valid, samples.force, 0.0),
         samples.sigma,
         valid,
@@ -161,7 +165,7 @@ def fit_samples(
     *,
     n_groups: int,
     max_steps: int = 64,
-    rounds: int = ROUNDS,
+    iterations: int = ITERATIONS,
 ) -> FittedCurve:
     """The pure fit of one pad: fixed shapes, works under jit, vmap and grad, never raises; see `fit_curves`.
 
@@ -170,29 +174,29 @@ def fit_samples(
     """
     used, problem, present = fit = _prepare(curve, samples, loss, n_groups)
     curve, scale = problem.curve, problem.scale
-    end, ended = _solve(problem, solver, max_steps, rounds)
+    end, ended = _solve(problem, solver, max_steps, iterations)
     found = covariance_at(end, problem)
 
     n, k = jnp.sum(used.valid), end.free.size
     params = curve.bound(end.free, scale)
     limits = _pressure_range(used)
     groups = _groups_used(used, n_groups)
-    clean = jnp.all(present | ~samples.valid)
-    result = _judge(
-        finite=clean & (n > 0) & jnp.all(jnp.isfinite(params)),
+    complete = jnp.all(present | ~samples.valid)
+    result = _result_code(
+        finite=complete & (n > 0) & jnp.all(jnp.isfinite(params)),
         enough=(n > k) & ((groups > k) if n_groups else True),
         ended=ended,
         rises=jnp.diff(curve(params, limits))[0] > MIN_RISE * scale.force,
         determined=(found.rank == k) & found.enough,
-        inside=~jnp.any(end.vanished) | (found.missed < MAX_CONTRADICTION),
+        inside=~jnp.any(end.at_bound) | (found.contradiction < MAX_CONTRADICTION),
     )
-    return _estimates(fit, params, end, found, result)
+    return _fitted_curve(fit, params, end, found, result)
 
 
-def _estimates(
+def _fitted_curve(
     fit: _Fit, params: Float[Array, " k"], end: CurveMinimum, found: CurveCovariance, result: Int[Array, ""]
 ) -> FittedCurve:
-    """What the fit tells of its curve; NaN for what its result code does not let be used."""
+    """The fitted curve; NaN for what is not valid by the result code."""
     used, curve = fit.used, fit.problem.curve
     n, k = jnp.sum(used.valid), end.free.size
     limits = _pressure_range(used)
@@ -221,22 +225,22 @@ def _fit_pads(
     solver: Solver,
     n_groups: int,
     max_steps: int,
-    rounds: int,
+    iterations: int,
 ) -> FittedCurve:
     found: FittedCurve = eqx.filter_vmap(
-        lambda s: fit_samples(curve, s, loss, solver, n_groups=n_groups, max_steps=max_steps, rounds=rounds)
+        lambda s: fit_samples(curve, s, loss, solver, n_groups=n_groups, max_steps=max_steps, iterations=iterations)
     )(samples)
     return found
 
 
 @je.verb
-def _try_pads(curve: AbstractCurve, samples: Samples, loss: AbstractLoss) -> Trial:
-    def one(samples: Samples) -> Trial:
+def _evaluate_starts(curve: AbstractCurve, samples: Samples, loss: AbstractLoss) -> StartValues:
+    def one(samples: Samples) -> StartValues:
         used, problem, _ = _prepare(curve, samples, loss, 0)
-        return trial(problem, _pressure_range(used))
+        return evaluate_start(problem, _pressure_range(used))
 
-    tried: Trial = eqx.filter_vmap(one)(samples)
-    return tried
+    values: StartValues = eqx.filter_vmap(one)(samples)
+    return values
 
 
 def fit_curves(
@@ -263,7 +267,7 @@ def fit_curves(
       sigma: (n,) or (pads, n) noise of the force, up to a common factor; default: equal.
       loss: `SoftL1()` by default; also `Huber`, `Cauchy`, `Squared`.
       solver: an optimistix least-squares solver (default: `default_solver`).
-      max_steps: limit of the solver's steps in each round.
+      max_steps: limit of the solver's steps in each iteration.
       dtype: of the fit; default: that of the input. float64 is refused where JAX has 64-bit numbers off.
 
     Returns:
@@ -281,12 +285,14 @@ def fit_curves(
     """
     shape = np.shape(pressures)
     length = bucket(shape[1]) if len(shape) == 2 else None
-    samples, n_groups = gather(pressures, forces, mask=mask, groups=groups, sigma=sigma, dtype=dtype, length=length)
+    samples, n_groups = make_samples(
+        pressures, forces, mask=mask, groups=groups, sigma=sigma, dtype=dtype, length=length
+    )
     loss = SoftL1() if loss is None else loss
     solver = default_solver(samples.pressure.dtype) if solver is None else solver
     if is_own(curve):
-        require_sound(curve, _try_pads(curve, samples, loss))
-    return _fit_pads(curve, samples, loss, solver, bucket(n_groups) if n_groups else 0, max_steps, ROUNDS)
+        require_rising(curve, _evaluate_starts(curve, samples, loss))
+    return _fit_pads(curve, samples, loss, solver, bucket(n_groups) if n_groups else 0, max_steps, ITERATIONS)
 
 
 def fit_curve(

@@ -1,6 +1,6 @@
 """What a curve of a user's own must keep: one finite force for each pressure, which rises, and the same of its inverse.
 
-The curves of this package keep it by construction and are not tried. Without this check a curve that is NaN or falls
+The curves of this package keep it by construction and are not checked. Without this check a curve that is NaN or falls
 would look like a pad that does not respond.
 """
 
@@ -14,11 +14,11 @@ from ..results import FitError
 from .base import AbstractCurve
 from .problem import CurveProblem
 
-POINTS = 33
+CHECK_POINTS = 33
 MAX_FALL = 1e-3  # of the largest force; more than rounding in float32
 
 
-class Trial(NamedTuple):
+class StartValues(NamedTuple):
     """A curve with the parameters of its start, at rising pressures over the range of a pad's samples.
 
     | field    | meaning                                  | shape        | unit          |
@@ -40,17 +40,17 @@ def is_own(curve: AbstractCurve) -> bool:
     return type(curve).__module__.rpartition(".")[0] != __package__
 
 
-def trial(problem: CurveProblem, limits: Float[Array, "2"]) -> Trial:
+def evaluate_start(problem: CurveProblem, limits: Float[Array, "2"]) -> StartValues:
     """Try the curve of a problem at pressures between two limits, Pa; `FitError` for results of another shape; pure."""
     curve = problem.curve
     params = curve.bound(problem.start, problem.scale)
-    pressure = jnp.linspace(limits[0], limits[1], POINTS)
-    force = _of_shape(curve, "__call__", curve(params, pressure), pressure)
-    back = _of_shape(curve, "inverse", curve.inverse(params, force), force)
-    return Trial(params, pressure, force, back)
+    pressure = jnp.linspace(limits[0], limits[1], CHECK_POINTS)
+    force = _require_shape(curve, "__call__", curve(params, pressure), pressure)
+    back = _require_shape(curve, "inverse", curve.inverse(params, force), force)
+    return StartValues(params, pressure, force, back)
 
 
-def _of_shape(curve: AbstractCurve, method: str, found: Any, given: Array) -> Array:
+def _require_shape(curve: AbstractCurve, method: str, found: Any, given: Array) -> Array:
     shape = getattr(found, "shape", None)
     if shape != given.shape:
         what = f"of shape {shape}" if shape is not None else f"of type {type(found).__name__}"
@@ -61,17 +61,17 @@ def _of_shape(curve: AbstractCurve, method: str, found: Any, given: Array) -> Ar
     return found  # type: ignore[no-any-return]
 
 
-def require_sound(curve: AbstractCurve, tried: Trial) -> None:
+def require_rising(curve: AbstractCurve, values: StartValues) -> None:
     """Refuse a curve that is not finite, or that falls, at the start of its fit to a pad; pads count from 0.
 
     Raises:
         FitError: names the class, its method and the pad.
     """
     name = type(curve).__name__
-    for pad, (params, pressure, force, back) in enumerate(zip(*map(np.asarray, tried), strict=True)):
+    for pad, (params, pressure, force, back) in enumerate(zip(*map(np.asarray, values), strict=True)):
         if not np.isfinite(pressure).all():
             continue
-        at = f"with {_listed(curve, params)}, the start of its fit to pad {pad}"
+        at = f"with {_parameter_text(curve, params)}, the start of its fit to pad {pad}"
         if (bad := ~np.isfinite(force)).any():
             what = f"returns {force[bad][0]} N at {pressure[bad][0]:g} Pa,"
             raise FitError(f"{name}.__call__ {what} {at}; return a finite force for each finite pressure")
@@ -85,7 +85,7 @@ def require_sound(curve: AbstractCurve, tried: Trial) -> None:
             raise FitError(f"{name}.inverse {what} {at}; return the pressure of each force of the curve")
 
 
-def _listed(curve: AbstractCurve, params: np.ndarray) -> str:
+def _parameter_text(curve: AbstractCurve, params: np.ndarray) -> str:
     """Names and values of parameters."""
     parts = zip(curve.names, params, curve.units, strict=True)
     return ", ".join(f"{name} = {value:g} {unit}" for name, value, unit in parts)

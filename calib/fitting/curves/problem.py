@@ -16,7 +16,7 @@ from .samples import Samples
 TIME_BLOCKS = 20
 # Lower bound of a slope or exponent, as a multiple of its start, about exp(-12). It stands for zero, whose logarithm is
 # not finite.
-SMALLEST_MULTIPLE = 6e-6
+MIN_MULTIPLE = 6e-6
 
 Parameters = Float[Array, " k"]
 Spread = Float[Array, ""] | float
@@ -79,37 +79,37 @@ class CurveProblem(eqx.Module):
     @property
     def lower(self) -> Parameters:
         """Lower bounds of the multiples."""
-        return jnp.where(self.curve.positive, SMALLEST_MULTIPLE, -jnp.inf).astype(self.start.dtype)
+        return jnp.where(self.curve.positive, MIN_MULTIPLE, -jnp.inf).astype(self.start.dtype)
 
     @property
     def bends(self) -> Float[Array, "m k"]:
         """Roughness penalty, see `AbstractCurve.bends`."""
         return jnp.asarray(self.curve.bends, self.start.dtype)
 
-    def vanished(self, multiple: Parameters) -> Bool[Array, " k"]:
+    def at_bound(self, multiple: Parameters) -> Bool[Array, " k"]:
         """Flags of the slopes and exponents that ended on their lower bound."""
-        return jnp.asarray(self.curve.positive) & (multiple < 2 * SMALLEST_MULTIPLE)
+        return jnp.asarray(self.curve.positive) & (multiple < 2 * MIN_MULTIPLE)
 
     def free(self, multiple: Parameters) -> Parameters:
         """Free parameters, from multiples of the start."""
-        above = jnp.maximum(multiple, SMALLEST_MULTIPLE)
-        return jnp.where(self.curve.positive, self.start + jnp.log(above), multiple)
+        positive = jnp.maximum(multiple, MIN_MULTIPLE)
+        return jnp.where(self.curve.positive, self.start + jnp.log(positive), multiple)
 
-    def weights(self, multiple: Parameters, bent: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Scale of the residuals at `multiple`; weight of the penalty, `bent` times the root of the design effect."""
+    def weights(self, multiple: Parameters, penalty: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Scale of the residuals at `multiple`; weight of the penalty: `penalty` by the root of the design effect."""
         spread = residual_scale(self.free(multiple), self.curve, self.samples, self.scale)
         if not len(self.bends):
-            return spread, bent
+            return spread, penalty
         influence = self.loss.psi(residuals(self.free(multiple), self.curve, self.samples, self.scale, spread))
-        return spread, bent * jnp.sqrt(design_effect(influence, self.samples, self.n_groups))
+        return spread, penalty * jnp.sqrt(design_effect(influence, self.samples, self.n_groups))
 
     def objective(
         self, multiple: Parameters, spread: Float[Array, ""], weight: Float[Array, ""]
     ) -> Float[Array, " residuals"]:
         """Residuals whose squares are the loss, then those of the penalty, its slopes clipped at their bound too."""
-        left = residuals(self.free(multiple), self.curve, self.samples, self.scale, spread)
-        bends = weight * (self.bends @ jnp.maximum(multiple, SMALLEST_MULTIPLE))
-        return jnp.concatenate([self.loss.transform(left), bends])
+        r = residuals(self.free(multiple), self.curve, self.samples, self.scale, spread)
+        bends = weight * (self.bends @ jnp.maximum(multiple, MIN_MULTIPLE))
+        return jnp.concatenate([self.loss.transform(r), bends])
 
     def curvature(self, transformed: Float[Array, " residuals"]) -> Float[Array, " residuals"]:
         """`AbstractLoss.curvature` of the samples' residuals; one for those of the penalty, which are squared."""

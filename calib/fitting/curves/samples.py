@@ -54,7 +54,7 @@ def by_rows(program: Callable[..., Any], *rows: Any, before: tuple[Any, ...] = (
     return jax.tree.map(lambda part: np.asarray(part)[:count], program(*before, *wide))
 
 
-def gather(
+def make_samples(
     pressures: Any, forces: Any, *, mask: Any = None, groups: Any = None, sigma: Any = None, dtype: Any = None,
     length: int | None = None,
 ) -> tuple[Samples, int]:  # fmt: skip

@@ -81,7 +81,7 @@ def cubic_bspline(z: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.where(z < 1, inner, jnp.maximum(2 - z, 0) ** 3 / 6)
 
 
-def restored(kind: type[AbstractField], settings: Mapping[str, np.ndarray]) -> AbstractField:
+def restore_field(kind: type[AbstractField], settings: Mapping[str, np.ndarray]) -> AbstractField:
     """The field of this class whose settings were stored as arrays, by setting."""
     given = {name: _setting(value) for name, value in settings.items()}
     kept = {name: value for name, value in given.items() if name not in kind.former or value != kind.former[name]}

@@ -19,7 +19,7 @@ from jaxeit.linalg.lapack import eigh, solve
 PRIOR_RATIOS = np.logspace(-3, 7, 41)
 
 
-class LevelFree(NamedTuple):
+class ProjectedPresses(NamedTuple):
     """Weighted features z (n, m) and log ratios y (n,) of presses without the pads' levels; degrees of freedom left."""
 
     z: Array
@@ -27,18 +27,18 @@ class LevelFree(NamedTuple):
     degrees: Array
 
 
-def without_levels(
+def project_out_levels(
     z: Float[Array, "n m"], y: Float[Array, " n"], share: Float[Array, "n pads"], weight: Float[Array, " n"]
-) -> LevelFree:
+) -> ProjectedPresses:
     """Project the levels of the pads out of features and log ratios, since they belong to the curves."""
     root = jnp.sqrt(weight)[:, None]
     z, y, x = z * root, y * root[:, 0], share * root
     present = jnp.sum(x**2, 0) > 0
     gram = x.T @ x + jnp.diag(jnp.where(present, 1e-12, 1.0).astype(x.dtype))
     levels = solve(gram, x.T @ jnp.column_stack([z, y]))
-    left = jnp.column_stack([z, y]) - x @ levels
+    residual = jnp.column_stack([z, y]) - x @ levels
     degrees = jnp.sum(weight) - jnp.sum(present, dtype=weight.dtype)
-    return LevelFree(left[:, :-1], left[:, -1], jnp.maximum(degrees, 1.0))
+    return ProjectedPresses(residual[:, :-1], residual[:, -1], jnp.maximum(degrees, 1.0))
 
 
 class Posterior(NamedTuple):
@@ -55,7 +55,7 @@ class Posterior(NamedTuple):
     effective: Array
 
 
-class _Shape(NamedTuple):
+class _ShapePosterior(NamedTuple):
     """Posteriors of one shape of prior, in the axes in which the prior of every size is diagonal; rows are sizes.
 
     | field    | meaning                                                | shape      |
@@ -76,37 +76,37 @@ class _Shape(NamedTuple):
     trace: Array
 
 
-def _of_shape(levelled: LevelFree, shape: Float[Array, " m"]) -> _Shape:
+def _shape_posterior(projected: ProjectedPresses, shape: Float[Array, " m"]) -> _ShapePosterior:
     root, ratio = jnp.sqrt(shape), jnp.asarray(PRIOR_RATIOS, shape.dtype)[:, None]
-    values, vectors = eigh(root[:, None] * (levelled.z.T @ levelled.z) * root)
+    values, vectors = eigh(root[:, None] * (projected.z.T @ projected.z) * root)
     values, axes = jnp.maximum(values, 0), root[:, None] * vectors
-    moment = axes.T @ (levelled.z.T @ levelled.y)
+    moment = axes.T @ (projected.z.T @ projected.y)
     shrink = ratio / (1 + ratio * values)
-    square = jnp.maximum(levelled.y @ levelled.y - jnp.sum(shrink * moment**2, 1), jnp.finfo(shape.dtype).tiny)
-    evidence = -0.5 * (jnp.sum(jnp.log1p(ratio * values), 1) + levelled.degrees * jnp.log(square))
+    square = jnp.maximum(projected.y @ projected.y - jnp.sum(shrink * moment**2, 1), jnp.finfo(shape.dtype).tiny)
+    evidence = -0.5 * (jnp.sum(jnp.log1p(ratio * values), 1) + projected.degrees * jnp.log(square))
     trace = jnp.sum(values * shrink, 1)
-    return _Shape(evidence, square / levelled.degrees, shrink, shrink * moment, axes, trace)
+    return _ShapePosterior(evidence, square / projected.degrees, shrink, shrink * moment, axes, trace)
 
 
-def average_over_priors(levelled: LevelFree, shapes: Float[Array, "shapes m"]) -> Posterior:
+def average_over_priors(projected: ProjectedPresses, shapes: Float[Array, "shapes m"]) -> Posterior:
     """Posterior over all sizes and shapes of the prior; its covariance by the law of total variance."""
-    each = jax.lax.map(lambda shape: _of_shape(levelled, shape), shapes)
-    weight = jnp.exp(each.evidence - jnp.max(each.evidence))
+    posteriors = jax.lax.map(lambda shape: _shape_posterior(projected, shape), shapes)
+    weight = jnp.exp(posteriors.evidence - jnp.max(posteriors.evidence))
     weight = weight / jnp.sum(weight)
-    of_shape = jnp.sum(weight, 1)
-    share = weight / jnp.where(of_shape > 0, of_shape, 1)[:, None]
-    middle = jnp.einsum("sr,srk->sk", share, each.moment)
-    about = each.moment - middle[:, None]
-    within = jnp.einsum("sr,sri,srj->sij", weight, about, about)
-    within = within + jax.vmap(jnp.diag)(jnp.einsum("sr,sr,srk->sk", weight, each.variance, each.shrink))
-    means = jnp.einsum("sik,sk->si", each.axes, middle)
-    mean = of_shape @ means
-    between = jnp.einsum("s,si,sj->ij", of_shape, means - mean, means - mean)
-    covariance = jnp.einsum("sik,skl,sjl->ij", each.axes, within, each.axes) + between
+    shape_weight = jnp.sum(weight, 1)
+    share = weight / jnp.where(shape_weight > 0, shape_weight, 1)[:, None]
+    shape_mean = jnp.einsum("sr,srk->sk", share, posteriors.moment)
+    deviation = posteriors.moment - shape_mean[:, None]
+    within = jnp.einsum("sr,sri,srj->sij", weight, deviation, deviation)
+    within = within + jax.vmap(jnp.diag)(jnp.einsum("sr,sr,srk->sk", weight, posteriors.variance, posteriors.shrink))
+    means = jnp.einsum("sik,sk->si", posteriors.axes, shape_mean)
+    mean = shape_weight @ means
+    between = jnp.einsum("s,si,sj->ij", shape_weight, means - mean, means - mean)
+    covariance = jnp.einsum("sik,skl,sjl->ij", posteriors.axes, within, posteriors.axes) + between
     return Posterior(
         mean,
         covariance,
-        jnp.max(each.evidence),
-        jnp.sum(weight * each.variance),
-        jnp.sum(weight * each.trace),
+        jnp.max(posteriors.evidence),
+        jnp.sum(weight * posteriors.variance),
+        jnp.sum(weight * posteriors.trace),
     )

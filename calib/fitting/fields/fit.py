@@ -14,7 +14,7 @@ from ...presses.pooled import MIN_SHARE
 from ...presses.streams import MAD_TO_SIGMA
 from ..results import FitResult
 from .base import AbstractField
-from .evidence import LevelFree, Posterior, average_over_priors, without_levels
+from .evidence import Posterior, ProjectedPresses, average_over_priors, project_out_levels
 from .fitted import FittedField, pad_features
 from .geometry import Geometry, onto_pads, relative_to_pads
 from .places import Places
@@ -22,8 +22,8 @@ from .places import Places
 # Distance from the field, in standard deviations, beyond which a press loses weight (Huber's weights): 1 % of normal
 # noise lies beyond.
 HUBER_WIDTH = 2.5
-# Fits, each with Huber's weights from the one before; the first has weights of one.
-ROUNDS = 3
+# Number of iteratively reweighted fits; the first has weights of one.
+ITERATIONS = 3
 
 
 def _supported_box(
@@ -40,9 +40,9 @@ def _supported_box(
     Pads that share a field share its support.
     """
     place = relative_to_pads(geometry, onto_pads(geometry, places.position))
-    sound = jnp.isfinite(place) & (places.weight > 0)[..., None] & (share >= MIN_SHARE)[:, None, :, None]
+    valid = jnp.isfinite(place) & (places.weight > 0)[..., None] & (share >= MIN_SHARE)[:, None, :, None]
     over = (0, 1, 2) if field.shared else (0, 1)
-    low, high = jnp.min(jnp.where(sound, place, jnp.inf), over), jnp.max(jnp.where(sound, place, -jnp.inf), over)
+    low, high = jnp.min(jnp.where(valid, place, jnp.inf), over), jnp.max(jnp.where(valid, place, -jnp.inf), over)
     none = low > high
     low, high = field.supported(jnp.where(none, -1, low), jnp.where(none, 1, high))
     corner, far = geometry.start.min(1), geometry.start.max(1)
@@ -67,13 +67,13 @@ def _centred_features(
 
 
 def _huber_weights(
-    levelled: LevelFree, coefficients: Float[Array, " m"], valid: Bool[Array, " n"]
+    projected: ProjectedPresses, coefficients: Float[Array, " m"], valid: Bool[Array, " n"]
 ) -> Float[Array, " n"]:
     """Huber's weights: 1 for presses within `HUBER_WIDTH` of the field, falling as 1 / distance beyond."""
-    left = jnp.abs(levelled.y - levelled.z @ coefficients)
-    size = MAD_TO_SIGMA * jnp.nanmedian(jnp.where(valid & (left > 0), left, jnp.nan))
-    far = HUBER_WIDTH * jnp.where(size > 0, size, jnp.inf)
-    return jnp.minimum(1.0, far / jnp.maximum(left, jnp.finfo(left.dtype).tiny))
+    residual = jnp.abs(projected.y - projected.z @ coefficients)
+    deviation = MAD_TO_SIGMA * jnp.nanmedian(jnp.where(valid & (residual > 0), residual, jnp.nan))
+    width = HUBER_WIDTH * jnp.where(deviation > 0, deviation, jnp.inf)
+    return jnp.minimum(1.0, width / jnp.maximum(residual, jnp.finfo(residual.dtype).tiny))
 
 
 def _robust_posterior(
@@ -85,20 +85,20 @@ def _robust_posterior(
 ) -> tuple[Posterior, Float[Array, ""], Float[Array, ""]]:
     """Posterior of the coefficients; weighted sum of squares of y without the levels; its degrees of freedom."""
 
-    def one_round(trust: Array, _: None) -> tuple[Array, tuple[Posterior, Array, Array]]:
-        levelled = without_levels(z, y, share, weight * trust)
-        found = average_over_priors(levelled, shapes)
+    def reweight(huber: Array, _: None) -> tuple[Array, tuple[Posterior, Array, Array]]:
+        projected = project_out_levels(z, y, share, weight * huber)
+        found = average_over_priors(projected, shapes)
         # Outliers are judged by the distance of the whole press, not by the part that weights of a shared place leave.
-        plain = without_levels(z, y, share, (weight > 0).astype(z.dtype))
-        trust = _huber_weights(plain, found.coefficients, weight > 0)
-        return trust, (found, jnp.sum(levelled.y**2), levelled.degrees)
+        plain = project_out_levels(z, y, share, (weight > 0).astype(z.dtype))
+        huber = _huber_weights(plain, found.coefficients, weight > 0)
+        return huber, (found, jnp.sum(projected.y**2), projected.degrees)
 
-    _, rounds = jax.lax.scan(one_round, jnp.ones_like(y), None, length=ROUNDS)
-    found, square, degrees = jax.tree.map(lambda leaf: leaf[-1], rounds)
+    _, iterations = jax.lax.scan(reweight, jnp.ones_like(y), None, length=ITERATIONS)
+    found, square, degrees = jax.tree.map(lambda leaf: leaf[-1], iterations)
     return found, square, degrees
 
 
-def _counted(
+def _valid_presses(
     places: Places, log_ratio: Float[Array, " n"], share: Float[Array, "n pads"], weight: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Float[Array, "n pads"], Float[Array, " n"]]:
     """Log ratios, shares and weights, without the presses that are not finite or whose place is not known."""
@@ -146,15 +146,15 @@ def fit_field(
             )
             print(f"{fitting.FIELDS.text(field)}: scatter {found.noise:.3f} of {found.spread:.3f}")
     """
-    y, share, weight = _counted(places, log_ratio, share, weight)
+    y, share, weight = _valid_presses(places, log_ratio, share, weight)
     reach = _supported_box(field, geometry, places, jnp.where(weight[:, None] > 0, share, 0), reach)
     z, centre = _centred_features(pad_features(field, geometry, places, reach), share, weight)
     shapes = jnp.asarray(np.tile(field.shapes(), (1, 1 if field.shared else geometry.pads)), z.dtype)
     found, square, degrees = _robust_posterior(z, y, share, weight, shapes)
     n = jnp.sum(weight)
     enough = n >= 2 + jnp.sum(jnp.sum(share * weight[:, None], 0) > 0, dtype=n.dtype)
-    sound = jnp.all(jnp.isfinite(found.coefficients)) & jnp.all(jnp.isfinite(found.covariance))
-    result = jnp.select([~enough, ~sound], [FitResult.TOO_FEW, FitResult.NOT_FINITE], FitResult.SUCCESS)
+    finite = jnp.all(jnp.isfinite(found.coefficients)) & jnp.all(jnp.isfinite(found.covariance))
+    result = jnp.select([~enough, ~finite], [FitResult.TOO_FEW, FitResult.NOT_FINITE], FitResult.SUCCESS)
     good = result == FitResult.SUCCESS
     return FittedField(
         field=field,

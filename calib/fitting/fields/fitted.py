@@ -65,12 +65,12 @@ class FittedField(eqx.Module):
         those at an unknown place.
         """
         anywhere = jnp.zeros_like(self.reach) + jnp.asarray([[-jnp.inf], [jnp.inf]], self.reach.dtype)
-        held, there = jax.vmap(partial(self.centred, places))(jnp.stack([self.reach, anywhere]))
-        between = (there - held) @ self.coefficients
-        variance = jnp.einsum("npi,ij,npj->np", there, self.covariance, there) + between**2
+        inside, extrapolated = jax.vmap(partial(self.centred, places))(jnp.stack([self.reach, anywhere]))
+        between = (extrapolated - inside) @ self.coefficients
+        variance = jnp.einsum("npi,ij,npj->np", extrapolated, self.covariance, extrapolated) + between**2
         unknown = jnp.maximum(self.spread**2 - self.noise**2, 0)
         variance = jnp.maximum(variance, jnp.minimum(self.error_scale**2 * variance, unknown))
-        return LogGain(held @ self.coefficients, jnp.where(places.known, variance, unknown))
+        return LogGain(inside @ self.coefficients, jnp.where(places.known, variance, unknown))
 
     def centred(self, places: Places, reach: Float[Array, "pads 2 2"]) -> Float[Array, "n pads m"]:
         """Features less those of the presses, with contacts inside the box `reach`; 0 where the place is not known."""
@@ -104,8 +104,8 @@ def pad_features(
     present = jnp.all(jnp.isfinite(places.position), -1)
     width = jnp.where(present, places.width, REFERENCE_WIDTH)
     place = onto_pads(geometry, jnp.where(present[..., None], places.position, 0))
-    held = place if reach is None else jnp.clip(place, reach[..., 0, :], reach[..., 1, :])
-    features = field.features(geometry, held, width)
+    inside = place if reach is None else jnp.clip(place, reach[..., 0, :], reach[..., 1, :])
+    features = field.features(geometry, inside, width)
     weight = jnp.where(present[..., None], places.weight, 0)
     total = jnp.sum(weight, 1, keepdims=True)
     return jnp.sum((weight / jnp.where(total > 0, total, 1))[..., None] * features, 1)

@@ -16,11 +16,11 @@ from . import FittedField, Geometry, PadEdge, PadEdgeSpline, Places
 from .geometry import onto_pads
 from .pad_edge import wall_distances
 
-# Octaves between two distances that are worth a word: the grid above has 0.68 to 0.71, one of 15 x 15, whose intervals
-# hold, 0.60, and scattered presses have 0.1 to 0.2. And the octave from which on walls hardly matter.
-WIDE, FAR = 0.65, 2.0
-FEW = 0.03  # part of the presses that may lie between, because their places are estimates
-WHOLE = 0.9  # part of a press on one pad, from which the press tells of its walls
+# Least gap between two distances, in octaves, that is reported: the grid above has 0.68 to 0.71, one of 15 x 15, whose
+# intervals hold, 0.60, and scattered presses have 0.1 to 0.2. Octave beyond which walls have little effect.
+MIN_GAP_OCTAVES, MAX_WALL_OCTAVES = 0.65, 2.0
+GAP_SHARE = 0.03  # of the presses that may lie in a gap, because their places are estimates
+MIN_PAD_SHARE = 0.9  # least share of a pad in a press that informs on its walls
 
 
 def unpressed_note(field: FittedField | None, places: Places | None, share: Float[np.ndarray, "n pads"]) -> str:
@@ -33,9 +33,9 @@ def unpressed_note(field: FittedField | None, places: Places | None, share: Floa
     if field is None or places is None or not isinstance(field.field, PadEdge):
         return ""
     metres = np.sort(_wall_distances(field.geometry, places, share))
-    octaves, few = np.log2(1 + metres / float(field.field.width)), max(1, round(FEW * len(metres)))
-    gaps = np.where(octaves[:-few] < FAR, octaves[few:] - octaves[:-few], 0)
-    if gaps.max(initial=0) < WIDE:
+    octaves, few = np.log2(1 + metres / float(field.field.width)), max(1, round(GAP_SHARE * len(metres)))
+    gaps = np.where(octaves[:-few] < MAX_WALL_OCTAVES, octaves[few:] - octaves[:-few], 0)
+    if gaps.max(initial=0) < MIN_GAP_OCTAVES:
         return ""
     better = "" if isinstance(field.field, PadEdgeSpline) else "calibrate with --location edge-spline, or "
     low, high = 1e3 * metres[[gaps.argmax(), gaps.argmax() + few]]
@@ -48,12 +48,12 @@ def unpressed_note(field: FittedField | None, places: Places | None, share: Floa
 
 def _wall_distances(geometry: Geometry, places: Places, share: Float[np.ndarray, "n pads"]) -> Float[np.ndarray, " m"]:
     """Distance of each press that rests on one pad to the nearest side of that pad, m."""
-    own = by_rows(_to_sides, places.position[:, 0], before=(geometry,))[np.nan_to_num(share) >= WHOLE]
+    own = by_rows(_side_distances, places.position[:, 0], before=(geometry,))[np.nan_to_num(share) >= MIN_PAD_SHARE]
     found: np.ndarray = own[np.isfinite(own)]
     return found
 
 
 @je.verb
-def _to_sides(geometry: Geometry, position: Float[Array, "n 2"]) -> Float[Array, "n pads"]:
+def _side_distances(geometry: Geometry, position: Float[Array, "n 2"]) -> Float[Array, "n pads"]:
     """Distance of each pad's nearest side to the point of the pad that is nearest to a position, m."""
     return wall_distances(geometry, onto_pads(geometry, position))[0].min(-1)

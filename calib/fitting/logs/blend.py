@@ -10,7 +10,7 @@ from jaxeit.budget import require
 from ..curves.base import AbstractCurve
 from ..curves.fit import fit_curves
 from ..results import FitError, FitResult
-from .combination import Blend, OneChannel, one_channel, products
+from .combination import Blend, OneChannel, one_channel, quadratic_features
 
 
 def _ridge_solve(x: np.ndarray, y: np.ndarray, ridge: float) -> np.ndarray:
@@ -21,12 +21,12 @@ def _ridge_solve(x: np.ndarray, y: np.ndarray, ridge: float) -> np.ndarray:
 def _blend(signals: np.ndarray, force: np.ndarray, ridge: float) -> Blend:
     scale = np.abs(signals).max(axis=0)
     scale = np.where(scale > 0, scale, 1.0)
-    x = products(signals / scale)
+    x = quadratic_features(signals / scale)
     mean, offset = x.mean(axis=0), float(force.mean())
     return Blend(scale, mean, _ridge_solve(x - mean, force - offset, ridge), np.asarray(offset), np.asarray(ridge))
 
 
-# Penalties tried, relative to the number of samples.
+# Candidate penalties, relative to the number of samples.
 RIDGES = tuple(10.0**k for k in range(-10, 0))
 
 

@@ -124,7 +124,7 @@ class Blend(AbstractCombination):
 
     def signal(self, time: np.ndarray, values: Float[np.ndarray, "n channels"]) -> Float[np.ndarray, " n"]:
         del time
-        return np.asarray((products(values / self.scale) - self.mean) @ self.weights + self.offset)
+        return np.asarray((quadratic_features(values / self.scale) - self.mean) @ self.weights + self.offset)
 
     @property
     def words(self) -> str:
@@ -135,16 +135,16 @@ class Blend(AbstractCombination):
         return len(self.scale)
 
 
-def products(z: np.ndarray) -> np.ndarray:
+def quadratic_features(z: np.ndarray) -> np.ndarray:
     """Channels and all products of two of them, (n, features)."""
     i, j = np.triu_indices(z.shape[1])
     return np.concatenate([z, z[:, i] * z[:, j]], axis=1)
 
 
-STRETCHES = 32  # of the calibrated log, each of which has one history, so that they differ
-HISTORIES = 16  # those of them that are tried for a new log
+HISTORY_STRETCHES = 32  # of the calibrated log, with one history each, so that they differ
+MAX_HISTORIES = 16  # of a new log
 DECAY_TIMES = 6.0  # time constants after which a history no longer matters
-ROWS = 4096  # of the kernel matrix that are computed at once, so that memory does not grow with the log
+BLOCK_ROWS = 4096  # of the kernel matrix that are computed together, so that memory does not grow with the log
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,9 +196,9 @@ class SmoothSignal(AbstractCombination):
         """Differences from the lags that the calibrated log had, in several stretches, nearest to the first inputs."""
         lags = len(self.lags)
         distance = ((self.inputs[:, lags:] - first[lags:]) ** 2).sum(1)
-        parts = np.array_split(np.arange(len(distance)), min(STRETCHES, len(distance)))
+        parts = np.array_split(np.arange(len(distance)), min(HISTORY_STRETCHES, len(distance)))
         nearest = np.array([part[np.argmin(distance[part])] for part in parts])
-        rows = nearest[np.argsort(distance[nearest], kind="stable")[:HISTORIES]]
+        rows = nearest[np.argsort(distance[nearest], kind="stable")[:MAX_HISTORIES]]
         return np.asarray(self.inputs[rows, :lags])
 
     def tracker(self) -> "LagTracker":
@@ -206,12 +206,14 @@ class SmoothSignal(AbstractCombination):
 
     def forces(self, at: Float[np.ndarray, "n inputs"]) -> Float[np.ndarray, " n"]:
         """Force (n,) N at inputs of `lag_inputs`, in blocks of rows; NaN where an input is NaN."""
-        return np.concatenate([self._force(at[k : k + ROWS]) for k in range(0, len(at), ROWS)] or [np.empty(0)])
+        return np.concatenate(
+            [self._force(at[k : k + BLOCK_ROWS]) for k in range(0, len(at), BLOCK_ROWS)] or [np.empty(0)]
+        )
 
     def _force(self, at: np.ndarray) -> np.ndarray:
-        whole = np.isfinite(at).all(1)
+        complete = np.isfinite(at).all(1)
         out = np.full(len(at), np.nan)
-        out[whole] = kernel(self.hyper, at[whole], self.inputs) @ self.weights
+        out[complete] = kernel(self.hyper, at[complete], self.inputs) @ self.weights
         return out
 
     @property
@@ -260,10 +262,10 @@ def lag_inputs(time: np.ndarray, values: np.ndarray, axes: np.ndarray, lags: np.
     """Differences of the first component from its lags, then all components, (n, l + d); `time` (n,) in ns."""
     along = values @ axes.T
     seconds = np.asarray(time, float) / 1e9
-    return np.column_stack([*(along[:, 0] - lagged(seconds, along[:, 0], float(lag)) for lag in lags), along])
+    return np.column_stack([*(along[:, 0] - first_order_lag(seconds, along[:, 0], float(lag)) for lag in lags), along])
 
 
-def lagged(time: np.ndarray, signal: np.ndarray, lag: float) -> np.ndarray:
+def first_order_lag(time: np.ndarray, signal: np.ndarray, lag: float) -> np.ndarray:
     """First-order lag of a signal (n,) by `lag`, in the unit of time; missing samples do not change its state."""
     out, state, before = np.empty(len(signal)), np.nan, time[0] if len(time) else 0.0
     for k, (now, value) in enumerate(zip(time, signal, strict=True)):

@@ -1,6 +1,6 @@
-"""How often a log loads and unloads its sensor.
+"""Cycles and directions of load in a log.
 
-What is calibrated on a rise alone knows nothing of hysteresis, and few cycles tell little of how much cycles differ.
+A calibration on rising forces alone has no hysteresis, and few cycles do not determine how much cycles differ.
 """
 
 from typing import NamedTuple
@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-SWING = 0.25  # of the range of the forces, from which a rise or a fall counts
-LEAST = 0.5  # of the larger of rise and fall, above which a direction counts as seen
+MIN_STROKE_FRACTION = 0.25  # least rise or fall that counts, over the range of the forces
+MIN_DIRECTION_RATIO = 0.5  # least rise or fall of a direction that was loaded, over the larger of both
 
 
 class Travel(NamedTuple):
@@ -27,26 +27,26 @@ def travel_of(force: Float[np.ndarray, " n"], log: Int[np.ndarray, " n"] | None 
         print(logs.missing_direction(loading))  # a log that only rises tells no unloading branch
         print(logs.unseen_direction(loading, seen))
     """
-    parts = _logs(force, log)
+    parts = _split_logs(force, log)
     rises = [(part - np.minimum.accumulate(part)).max(initial=0.0) for part in parts]
     falls = [(np.maximum.accumulate(part) - part).max(initial=0.0) for part in parts]
     return Travel(float(max(rises, default=0.0)), float(max(falls, default=0.0)))
 
 
-def cycles_of(force: Float[np.ndarray, " n"], log: Int[np.ndarray, " n"] | None = None) -> int:
-    """Number of cycles, each a rise and a fall of at least `SWING` of the range of all forces; at least one."""
+def count_cycles(force: Float[np.ndarray, " n"], log: Int[np.ndarray, " n"] | None = None) -> int:
+    """Number of cycles of a rise and a fall of at least `MIN_STROKE_FRACTION` of the range of forces; at least one."""
     known = force[np.isfinite(force)]
-    swing = SWING * float(np.ptp(known)) if len(known) else 0.0
-    return max(sum(_strokes(part.tolist(), swing) for part in _logs(force, log)) // 2, 1)
+    swing = MIN_STROKE_FRACTION * float(np.ptp(known)) if len(known) else 0.0
+    return max(sum(_count_strokes(part.tolist(), swing) for part in _split_logs(force, log)) // 2, 1)
 
 
-def _logs(force: np.ndarray, log: np.ndarray | None) -> list[np.ndarray]:
+def _split_logs(force: np.ndarray, log: np.ndarray | None) -> list[np.ndarray]:
     """The forces of each log that are known."""
     number = np.zeros(len(force), int) if log is None else log
     return [force[(number == k) & np.isfinite(force)] for k in np.unique(number)]
 
 
-def _strokes(force: list[float], swing: float) -> int:
+def _count_strokes(force: list[float], swing: float) -> int:
     """Number of rises and falls of at least `swing`, between turning points."""
     count, way, low, high = 0, 0, np.inf, -np.inf
     for value in force:
@@ -60,7 +60,7 @@ def _strokes(force: list[float], swing: float) -> int:
 
 def unseen_direction(calibrated: Travel, found: Travel) -> str:
     """What the forces found do that those calibrated did not, in a sentence; empty: nothing."""
-    least = LEAST * max(calibrated)
+    least = MIN_DIRECTION_RATIO * max(calibrated)
     for name, before, now in zip(("rises", "falls"), calibrated, found, strict=True):
         if before < least <= now:
             return (
@@ -72,7 +72,7 @@ def unseen_direction(calibrated: Travel, found: Travel) -> str:
 
 def missing_direction(calibrated: Travel) -> str:
     """The direction that no calibrated log has, in a sentence; empty: none."""
-    least = LEAST * max(calibrated)
+    least = MIN_DIRECTION_RATIO * max(calibrated)
     for name, other, size in (("falls", "rises", calibrated.fall), ("rises", "falls", calibrated.rise)):
         if size < least:
             return (

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..cross_validation.scores import Score, score, trusted_forces
+from ..cross_validation.scores import Score, score, valid_forces
 from ..curves.base import AbstractCurve
 from ..curves.fit import fit_curves
 from ..curves.fitted import FittedCurve
@@ -88,7 +88,7 @@ def fit_log(
     combination = _combination(np.asarray(time), values, np.where(train, forces, np.nan), curve, channels)
     signal = combination.signal(np.asarray(time), values)
     fitted = fit_curves(curve, signal[None], forces, mask=train, **options)
-    predicted = trusted_forces(fitted, signal[None])[0]
+    predicted = valid_forces(fitted, signal[None])[0]
     scores = [score(predicted[m], forces[m]) for m in (train, rest & complete)]
     return LogFit(fitted.pad(0), signal, predicted, combination.words, int((~complete).sum()), *scores)
 

@@ -25,13 +25,13 @@ MAX_SAMPLES = 400
 MAX_CENTRES = 2000
 # Steps of the minimiser; the evidence is flat near its maximum.
 MAX_STEPS = 60
-# The same from hyperparameters that were found with more samples.
-STEPS_NEARBY = 10
+# Likewise from hyperparameters of a fit to more samples.
+MAX_REFINING_STEPS = 10
 # Noise variance that keeps the kernel matrix positive definite in float64 where samples repeat.
 JITTER = 1e-8
 
 
-class _Found(NamedTuple):
+class _Hyperparameters(NamedTuple):
     """Log evidence, number of components, and hyperparameters (unused components have a length too)."""
 
     evidence: float
@@ -77,21 +77,21 @@ class SmoothChannels:
         possible = [k + self.coordinates for k in self.directions if k <= channels] or [signals.shape[1]]
         axes = self._axes(signals[known], max(possible))
         inputs = lag_inputs(time, signals, axes, np.array(self.lags))[known]
-        rows = _evenly(len(inputs), MAX_SAMPLES)
+        rows = _evenly_spaced(len(inputs), MAX_SAMPLES)
         size = float(np.std(force[known]))
-        tried = [self._tried(inputs[rows], force[known][rows] / size, k) for k in possible]
-        best = max(tried, key=lambda found: found.evidence)
+        maxima = [self._maximise_evidence(inputs[rows], force[known][rows] / size, k) for k in possible]
+        best = max(maxima, key=lambda maximum: maximum.evidence)
         used = len(self.lags) + best.directions
         hyper = np.r_[best.hyper[:used], best.hyper[-3:]]
-        centres = _evenly(len(inputs), MAX_CENTRES)
-        weights = _weights(hyper, inputs[centres, :used], force[known][centres] / size) * size
+        centres = _evenly_spaced(len(inputs), MAX_CENTRES)
+        weights = _kernel_weights(hyper, inputs[centres, :used], force[known][centres] / size) * size
         return SmoothSignal(axes[: best.directions], np.array(self.lags, float), hyper, inputs[centres, :used], weights)
 
     def near(self, found: AbstractCombination) -> "SmoothChannels":
         """The way to fit to a part of the samples that `found` was fitted to: the same components, fewer steps."""
         assert isinstance(found, SmoothSignal)
         directions = (len(found.axes) - self.coordinates,)
-        return replace(self, directions=directions, start=found.hyper, max_steps=STEPS_NEARBY)
+        return replace(self, directions=directions, start=found.hyper, max_steps=MAX_REFINING_STEPS)
 
     def _axes(self, signals: np.ndarray, directions: int) -> np.ndarray:
         """Inputs (directions, columns): the first component, which has the lags, coordinates, further components."""
@@ -101,16 +101,16 @@ class SmoothChannels:
         wide = np.pad(own, ((0, 0), (0, self.coordinates)))
         return np.concatenate([wide[:1], np.eye(signals.shape[1])[-self.coordinates :], wide[1:]])
 
-    def _tried(self, inputs: np.ndarray, force: np.ndarray, directions: int) -> _Found:
+    def _maximise_evidence(self, inputs: np.ndarray, force: np.ndarray, directions: int) -> _Hyperparameters:
         """The hyperparameters of largest evidence; unused components are zero, so that all share a compiled program."""
         kept = inputs * (np.arange(inputs.shape[1]) < len(self.lags) + directions)
         start = np.r_[np.zeros(kept.shape[1]), 0.0, -1.0, np.log(0.03**2)] if self.start is None else self.start
         bounds = [(-7, 7)] * kept.shape[1] + [(-12, 12)] * 2 + [(-16, 2)]
         options = {"maxiter": self.max_steps}
-        found = minimize(
-            _cost_and_slope, start, (kept, force), jac=True, method="L-BFGS-B", bounds=bounds, options=options
+        solution = minimize(
+            _cost_and_gradient, start, (kept, force), jac=True, method="L-BFGS-B", bounds=bounds, options=options
         )
-        return _Found(-float(found.fun), directions, found.x)
+        return _Hyperparameters(-float(solution.fun), directions, solution.x)
 
 
 def _components(signals: np.ndarray, directions: int) -> np.ndarray:
@@ -120,18 +120,18 @@ def _components(signals: np.ndarray, directions: int) -> np.ndarray:
     return np.asarray(axes / np.where(size > 0, size, 1)[:, None])
 
 
-def _evenly(n: int, most: int) -> np.ndarray:
+def _evenly_spaced(n: int, most: int) -> np.ndarray:
     """At most `most` of the numbers 0 to n - 1, evenly spaced."""
     return np.linspace(0, n - 1, min(n, most)).astype(int)
 
 
-def _weights(hyper: np.ndarray, inputs: np.ndarray, force: np.ndarray) -> np.ndarray:
+def _kernel_weights(hyper: np.ndarray, inputs: np.ndarray, force: np.ndarray) -> np.ndarray:
     matrix = kernel(hyper, inputs, inputs)
     matrix[np.diag_indices(len(inputs))] += np.exp(hyper[-1]) + JITTER
     return np.asarray(linalg.cho_solve(linalg.cho_factor(matrix, lower=True, overwrite_a=True), force))
 
 
-def _cost_and_slope(hyper: np.ndarray, inputs: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
+def _cost_and_gradient(hyper: np.ndarray, inputs: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
     """Minus log evidence, up to a constant, and its gradient; in closed form, because it is computed hundreds of times.
 
     With K the covariance of y, a = K^-1 y and W = K^-1 - a a', the derivative is the sum of W dK / 2 (5.9).

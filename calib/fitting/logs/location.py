@@ -1,4 +1,4 @@
-"""The place of contact of a log, as its stage tells it.
+"""The place of contact of a log, by its stage.
 
 Two models use the place x: a gain over the place, F = exp(g(x)) h(s), with g a field as for pads
 (`calib.fitting.fields`) and h the curve of the signal s; or the combination of channels takes the two coordinates as
@@ -17,16 +17,16 @@ import jaxeit as je
 from ..curves.samples import by_rows
 from ..fields import AbstractField, FittedField, Geometry, fit_field, log_gain, single_places
 
-# Part of the largest force above which a sample belongs to a press.
-LOADED = 0.1
-# Distance of two presses at one place at most, as part of the diagonal of the box of all presses.
-SAME_PLACE = 0.03
+# Fraction of the largest force above which a sample belongs to a press.
+LOADED_FRACTION = 0.1
+# Largest distance of two presses at one place, over the diagonal of the box of all presses.
+MERGE_DISTANCE = 0.03
 MIN_PLACES = 8
 """Places of contact without which a log determines no field."""
 # Part of the box of the presses by which a place may lie outside it; as for the range of a channel.
-TOLERANCE = 0.05
+BOX_MARGIN = 0.05
 # Least side of the box over the longer one: presses along a line determine a field along it.
-LEAST_SIDE = 0.1
+MIN_SIDE_RATIO = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +47,11 @@ class LogLocation:
 
     def inputs(self, values: Float[np.ndarray, "n channels"], place: Float[np.ndarray, "n 2"]) -> np.ndarray:
         """What the combination takes: the channels and, without a gain, the place from -1 to 1 over the box."""
-        return values if self.gain is not None else np.column_stack([values, relative(self.box, place)])
+        return values if self.gain is not None else np.column_stack([values, box_coordinates(self.box, place)])
 
     def inside(self, place: Float[np.ndarray, "n 2"]) -> np.ndarray:
         """Flags (n,) of the places that are known and lie in the box of the presses, or little outside it."""
-        return inside(self.box, place)
+        return in_box(self.box, place)
 
     def gains(self, place: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray]:
         """Gain (n,) and variance of its logarithm; where the place is not known, 1 and the scatter over places."""
@@ -61,21 +61,21 @@ class LogLocation:
         return np.exp(mean), variance
 
 
-def relative(box: Float[np.ndarray, "2 2"], place: Float[np.ndarray, "n 2"]) -> np.ndarray:
+def box_coordinates(box: Float[np.ndarray, "2 2"], place: Float[np.ndarray, "n 2"]) -> np.ndarray:
     """Places (n, 2) from -1 to 1 over the box; outside of it at its border."""
     return np.asarray(np.clip((2 * place - box[0] - box[1]) / (box[1] - box[0]), -1, 1))
 
 
-def inside(box: Float[np.ndarray, "2 2"], place: Float[np.ndarray, "n 2"]) -> np.ndarray:
-    """Flags (n,) of places within the box, or less than `TOLERANCE` of it outside."""
-    margin = TOLERANCE * (box[1] - box[0])
+def in_box(box: Float[np.ndarray, "2 2"], place: Float[np.ndarray, "n 2"]) -> np.ndarray:
+    """Flags (n,) of places within the box, or less than `BOX_MARGIN` of it outside."""
+    margin = BOX_MARGIN * (box[1] - box[0])
     return np.asarray(((place >= box[0] - margin) & (place <= box[1] + margin)).all(1))
 
 
-def box_of(place: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 2"]:
-    """Lowest and highest corner of places, at least `LEAST_SIDE` as wide as long."""
+def bounding_box(place: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 2"]:
+    """Lowest and highest corner of places, at least `MIN_SIDE_RATIO` as wide as long."""
     low, high = place.min(0), place.max(0)
-    side = np.maximum(high - low, max(LEAST_SIDE * float((high - low).max()), 1e-6))
+    side = np.maximum(high - low, max(MIN_SIDE_RATIO * float((high - low).max()), 1e-6))
     middle = (low + high) / 2
     return np.stack([middle - side / 2, middle + side / 2])
 
@@ -83,27 +83,27 @@ def box_of(place: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 2"]:
 def loaded_rows(place: Float[np.ndarray, "n 2"], force: Float[np.ndarray, " n"]) -> np.ndarray:
     """Flags (n,) of the samples of presses whose place is known."""
     size = np.nan_to_num(np.abs(force))
-    return np.asarray((size > LOADED * size.max(initial=0)) & np.isfinite(place).all(1))
+    return np.asarray((size > LOADED_FRACTION * size.max(initial=0)) & np.isfinite(place).all(1))
 
 
-def sites_of(place: Float[np.ndarray, "n 2"], force: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Number (n,) of the place of contact of each sample, in an order that has nothing to do with where it lies.
+def cluster_sites(place: Float[np.ndarray, "n 2"], force: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Number (n,) of the place of contact of each sample, in random order.
 
-    Presses nearer to each other than `SAME_PLACE` are at one place. A sample without contact has the number of the
+    Presses nearer to each other than `MERGE_DISTANCE` are at one place. A sample without contact has the number of the
     press before.
     """
     rows = np.flatnonzero(loaded_rows(place, force))
     if not len(rows):
         return np.zeros(len(force), int)
-    near = SAME_PLACE * float(np.linalg.norm(np.ptp(place[rows], axis=0)))
+    near = MERGE_DISTANCE * float(np.linalg.norm(np.ptp(place[rows], axis=0)))
     first = np.empty((0, 2))
     number = np.full(len(force), -1)
     for row in rows:
-        away = np.linalg.norm(first - place[row], axis=1)
-        if not len(first) or away.min() > near:
+        distance = np.linalg.norm(first - place[row], axis=1)
+        if not len(first) or distance.min() > near:
             number[row], first = len(first), np.concatenate([first, place[row][None]])
         else:
-            number[row] = int(np.argmin(away))
+            number[row] = int(np.argmin(distance))
     last = np.maximum.accumulate(np.where(number >= 0, np.arange(len(number)), -1))
     filled = number[np.where(last >= 0, last, rows[0])]
     return np.asarray(np.random.default_rng(0).permutation(len(first))[filled])
@@ -158,7 +158,7 @@ def fit_gains(
     )
 
 
-def ratios(
+def gain_ratios(
     force: Float[np.ndarray, " n"],
     curve: Float[np.ndarray, "fits n"],
     rows: np.ndarray,
@@ -167,7 +167,7 @@ def ratios(
 ) -> Float[np.ndarray, "fits places"]:
     """Force over that of the curves at each place, by least squares over its flagged samples (fits, n); NaN: none."""
     rows = rows & np.isfinite(curve)
-    both = np.where(rows, np.nan_to_num(force) * curve, 0.0)
+    product = np.where(rows, np.nan_to_num(force) * curve, 0.0)
     square = np.where(rows, curve**2, 0.0)
-    top, bottom = (np.stack([np.bincount(site, one, count) for one in part]) for part in (both, square))
-    return np.asarray(np.where(bottom > 0, top / np.where(bottom > 0, bottom, 1.0), np.nan))
+    numerator, denominator = (np.stack([np.bincount(site, one, count) for one in part]) for part in (product, square))
+    return np.asarray(np.where(denominator > 0, numerator / np.where(denominator > 0, denominator, 1.0), np.nan))

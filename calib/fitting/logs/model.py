@@ -18,8 +18,8 @@ from .noise import LogNoise
 
 # Part of the range of a channel by which a reading may lie outside it; as for the pressure of a curve.
 RANGE_MARGIN = 0.05
-# Part of the range of the fitted signal below which a sensor counts as at rest.
-REST = 0.1
+# Fraction of the range of the fitted signal below which a sensor counts as at rest.
+REST_FRACTION = 0.1
 
 
 class LogPrediction(NamedTuple):
@@ -67,8 +67,8 @@ class LogModel:
     @property
     def words(self) -> str:
         """What the signal is made of."""
-        beside = self.location is not None and self.location.gain is None
-        return self.combination.words + (", the last two of which are the place" if beside else "")
+        has_place = self.location is not None and self.location.gain is None
+        return self.combination.words + (", the last two of which are the place" if has_place else "")
 
     def predict(
         self,
@@ -83,11 +83,11 @@ class LogModel:
         when it was nearest to the first reading and, for a curve with hysteresis that begins under load, a rise from
         the lowest and a fall from the highest fitted signal. Histories come together as time goes on.
         """
-        where = self.location
+        location = self.location
         place = np.full((len(values), 2), np.nan) if place is None else place
-        inputs = values if where is None else where.inputs(values, place)
+        inputs = values if location is None else location.inputs(values, place)
         possible = self.combination.possible_signals(time, inputs)
-        signals = self.with_starts(signals_for(self.curve.curve, possible))
+        signals = self.with_extreme_histories(filter_signals(self.curve.curve, possible))
         return with_noise(self.noise, time, *self.forces(signals, values, place))
 
     def forces(
@@ -97,29 +97,29 @@ class LogModel:
         place: Float[np.ndarray, "n 2"],
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Force, its standard error without the noise of readings, and validity of the last n signals."""
-        where = self.location
+        location = self.location
         count = len(signals)
         curves = jax.tree.map(lambda leaf: np.broadcast_to(np.asarray(leaf), (count, *np.shape(leaf))), self.curve)
         force, error, valid = (part[:, len(signals[0]) - len(values) :] for part in curve_forces(curves, signals))
         deviation = np.sqrt((error**2).mean(0) + force.var(0))
-        force, inside = force.mean(0), np.asarray(valid.all(0)) & within(self.reach, values)
-        if where is not None:
-            gain, variance = where.gains(place)
+        force, inside = force.mean(0), np.asarray(valid.all(0)) & in_ranges(self.reach, values)
+        if location is not None:
+            gain, variance = location.gains(place)
             deviation = gain * np.sqrt(deviation**2 + force**2 * variance)
-            force, inside = gain * force, inside & where.inside(place)
+            force, inside = gain * force, inside & location.inside(place)
         return force, deviation, inside
 
-    def with_starts(self, signals: Float[np.ndarray, "histories n"]) -> Float[np.ndarray, "more m"]:
+    def with_extreme_histories(self, signals: Float[np.ndarray, "histories n"]) -> Float[np.ndarray, "more m"]:
         """The signals after each extreme of a history, where the curve remembers and the log begins under load."""
         known = signals[0][np.isfinite(signals[0])]
         low, high = np.asarray(self.curve.pressure_range, float)
-        if not self.curve.curve.path or not len(known) or known[0] <= low + REST * (high - low):
+        if not self.curve.curve.path or not len(known) or known[0] <= low + REST_FRACTION * (high - low):
             return signals
         ends = [np.full((len(signals), 1), end) for end in (low, high)]
         return np.concatenate([np.concatenate([end, signals], 1) for end in ends])
 
 
-def signals_for(curve: AbstractCurve, signals: Float[np.ndarray, "fits n"]) -> Float[np.ndarray, "fits n"]:
+def filter_signals(curve: AbstractCurve, signals: Float[np.ndarray, "fits n"]) -> Float[np.ndarray, "fits n"]:
     """The signals as a curve takes them: for one with hysteresis, medians of three readings in turn.
 
     Such a curve remembers extremes: one reading that is a spike would shift its force until the signal turns again. The
@@ -149,14 +149,14 @@ def with_noise(
     return LogPrediction(force, deviation, force - half, force + half, valid)
 
 
-def within(reach: Float[np.ndarray, "2 channels"], values: Float[np.ndarray, "n channels"]) -> np.ndarray:
+def in_ranges(reach: Float[np.ndarray, "2 channels"], values: Float[np.ndarray, "n channels"]) -> np.ndarray:
     """Flags (n,) of the rows whose channels all lie within their ranges, or less than `RANGE_MARGIN` of it outside."""
     low, high = reach
     margin = RANGE_MARGIN * (high - low)
     return np.asarray(((values >= low - margin) & (values <= high + margin)).all(1))
 
 
-def reach_of(values: Float[np.ndarray, "n channels"]) -> Float[np.ndarray, "2 channels"]:
+def channel_ranges(values: Float[np.ndarray, "n channels"]) -> Float[np.ndarray, "2 channels"]:
     """Lowest and highest value of each channel."""
     return np.stack([values.min(0), values.max(0)])
 

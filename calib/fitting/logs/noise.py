@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..intervals import COVERAGE, MIN_GROUPS, NORMAL_MULTIPLE, most_likely_sizes, student_factor
+from ..intervals import COVERAGE, MIN_GROUPS, NORMAL_MULTIPLE, fit_variance_components, student_factor
 
-STRETCHES = 0.75  # share of the stretches of time in which the interval covers the readings
+STRETCH_COVERAGE = 0.75  # share of the stretches of time in which the interval covers the readings
 # s before and after a sample, over which the rate of its force is taken. It is as long as the lags of sensors are: a
 # longer one spreads the error of a sudden change over readings that do not have it.
 RATE_WINDOW = 0.05
@@ -36,7 +36,7 @@ class LogNoise(eqx.Module):
 
     def variance(self, time: np.ndarray, force: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Variance (N^2) of new readings about predicted forces (N) at times (ns)."""
-        terms = _terms(force, force_rate(time, force))
+        terms = _variance_terms(force, force_rate(time, force))
         return np.asarray(terms @ np.square([float(self.floor), float(self.fraction), float(self.lag)]))
 
 
@@ -65,18 +65,18 @@ def fit_log_noise(
         noise = logs.fit_log_noise(residual, time, fit.predicted, np.zeros(2000), stretch, repetitions=5)
         print(noise.floor, noise.fraction, noise.lag)  # N, 1, s
     """
-    terms = _terms(force, force_rate(time, force))
-    sound = np.isfinite(residual) & np.isfinite(terms).all(1) & np.isfinite(variance)
-    residual, terms, variance = residual[sound], terms[sound], variance[sound]
-    _, group, count = np.unique(group[sound], return_inverse=True, return_counts=True)
-    sizes = most_likely_sizes(residual, variance, 1 / count[group], terms)
+    terms = _variance_terms(force, force_rate(time, force))
+    finite = np.isfinite(residual) & np.isfinite(terms).all(1) & np.isfinite(variance)
+    residual, terms, variance = residual[finite], terms[finite], variance[finite]
+    _, group, count = np.unique(group[finite], return_inverse=True, return_counts=True)
+    sizes = fit_variance_components(residual, variance, 1 / count[group], terms)
     deviation = np.sqrt(np.maximum(variance + terms @ sizes**2, np.finfo(float).tiny))
     floor, fraction, lag = map(jnp.asarray, sizes)
-    wider = student_factor(repetitions)
-    return LogNoise(floor, fraction, lag, jnp.asarray(wider * _multiple(np.abs(residual) / deviation, group)))
+    factor = student_factor(repetitions)
+    return LogNoise(floor, fraction, lag, jnp.asarray(factor * _interval_multiple(np.abs(residual) / deviation, group)))
 
 
-def _multiple(pull: Float[np.ndarray, " n"], group: np.ndarray) -> float:
+def _interval_multiple(pull: Float[np.ndarray, " n"], group: np.ndarray) -> float:
     """The multiple that covers 90 % of the readings in three of four stretches of time.
 
     One that covers 90 % of all readings is exceeded by whole stretches: sensors drift, so that what comes after a log
@@ -85,7 +85,7 @@ def _multiple(pull: Float[np.ndarray, " n"], group: np.ndarray) -> float:
     stretches = np.unique(group)
     if len(stretches) < MIN_GROUPS:
         return NORMAL_MULTIPLE
-    return float(np.quantile([np.quantile(pull[group == k], COVERAGE) for k in stretches], STRETCHES))
+    return float(np.quantile([np.quantile(pull[group == k], COVERAGE) for k in stretches], STRETCH_COVERAGE))
 
 
 def force_rate(time: np.ndarray, force: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -99,5 +99,5 @@ def force_rate(time: np.ndarray, force: Float[np.ndarray, " n"]) -> Float[np.nda
     return np.where(known, rate, np.nan)
 
 
-def _terms(force: np.ndarray, rate: np.ndarray) -> np.ndarray:
+def _variance_terms(force: np.ndarray, rate: np.ndarray) -> np.ndarray:
     return np.stack([np.ones(len(force)), force**2, rate**2], 1)

@@ -2,7 +2,7 @@
 
 Every candidate is fitted to all used samples and, in the same compiled call, without each of a few folds. A fold is
 several blocks of time dealt out in turn: a single long stretch would measure extrapolation to states that occur in it
-alone. Only the later half of the blocks of a log decides, because a model is chosen for what comes after the
+alone. Only the later half of the blocks of a log is scored, because a model is chosen for what comes after the
 recording, and soft sensors run in: their first minutes are like no later ones. Standard errors come from the blocks as
 groups, because samples that follow each other err together.
 """
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from ..cross_validation.selection import Candidate, Tried, simplest
+from ..cross_validation.selection import Candidate, Option, simplest
 from ..curves import CURVES
 from ..curves.base import AbstractCurve
 from ..curves.elementary import Affine
@@ -27,10 +27,19 @@ from ..losses import AbstractLoss
 from ..results import FitError, FitResult
 from .blend import BestChannel, BlendChannels, WithPlace
 from .combination import AbstractCombination, one_channel
-from .directions import cycles_of, travel_of
+from .directions import count_cycles, travel_of
 from .gaussian_process import SmoothChannels
-from .location import LogLocation, box_of, fit_gains, inside, ratios, relative
-from .model import RANGE_MARGIN, LogModel, LogPrediction, curve_forces, reach_of, signals_for, with_noise, within
+from .location import LogLocation, bounding_box, box_coordinates, fit_gains, gain_ratios, in_box
+from .model import (
+    RANGE_MARGIN,
+    LogModel,
+    LogPrediction,
+    channel_ranges,
+    curve_forces,
+    filter_signals,
+    in_ranges,
+    with_noise,
+)
 from .noise import fit_log_noise
 from .series import LogSeries
 
@@ -40,13 +49,13 @@ Way = BestChannel | BlendChannels | SmoothChannels | WithPlace | None
 # Parts of time whose errors count as one in the quantile of the interval. Half of them decide; a quantile of 90 % from
 # ten would be their maximum, and many short ones err together.
 NOISE_BLOCKS = 40
-FOLDS = 5  # of blocks of time, which are held out in turn
-ROUNDS = 2  # of fits of the gain over places and of the curve, in turn
-COST_OF_WAY = 10.0  # effective coefficients that a way counts more than the one before it in the list of ways
+FOLDS = 5  # of blocks of time
+ITERATIONS = 2  # of alternate fits of the gain over places and of the curve
+WAY_PENALTY = 10.0  # effective coefficients that are added for a way over those of the one before it
 
 
 class HeldOut(NamedTuple):
-    """What fits without a sample's stretch of time predict for it; NaN for samples that are not used.
+    """Predictions of fits without the stretch of time of a sample; NaN for samples that are not used.
 
     | field    | meaning                                        | shape | unit |
     |----------|------------------------------------------------|-------|------|
@@ -95,14 +104,14 @@ class _Fits(NamedTuple):
     valid: np.ndarray
 
     @property
-    def good(self) -> np.ndarray:
+    def succeeded(self) -> np.ndarray:
         """Flags (fits,): the fit with all samples succeeded; others need no covariance, but all parameters."""
         result, rank = np.asarray(self.curves.result), np.asarray(self.curves.rank)
-        whole = (result == FitResult.SINGULAR) & (rank == self.curves.parameters.shape[1]) & (np.arange(len(rank)) > 0)
+        usable = (result == FitResult.SINGULAR) & (rank == self.curves.parameters.shape[1]) & (np.arange(len(rank)) > 0)
         if self.gains is not None:
-            whole &= np.asarray(self.gains.result) == FitResult.SUCCESS
+            usable &= np.asarray(self.gains.result) == FitResult.SUCCESS
             result = np.where(np.asarray(self.gains.result) == FitResult.SUCCESS, result, self.gains.result)
-        return np.asarray((result == FitResult.SUCCESS) | whole)
+        return np.asarray((result == FitResult.SUCCESS) | usable)
 
     @property
     def effective(self) -> float:
@@ -118,7 +127,7 @@ class _Problem:
         self.used = use & series.complete
         self.block = series.blocks(self.used)
         self.fold = self.block % folds
-        self.decides = self.used & series.late(self.block)
+        self.scored = self.used & series.late(self.block)
         kept = [self.used, *(self.used & (self.fold != k) for k in np.unique(self.fold[self.used]))]
         self.train = np.stack([rows for rows in kept if rows.any()])
         self._signals: dict[str, tuple[AbstractCombination, np.ndarray]] = {}
@@ -133,33 +142,33 @@ class _Problem:
     def box(self) -> np.ndarray:
         """Box of the used presses, (2, 2) m; the series has places."""
         assert self.series.place is not None
-        return box_of(self.series.place[self.used & self.series.loaded])
+        return bounding_box(self.series.place[self.used & self.series.loaded])
 
     @cached_property
     def inside(self) -> np.ndarray:
         """Flags (fits, n): channels, and places, within the ranges of the samples of each fit."""
         values, place = self.series.values, self.series.place
-        found = np.stack([within(reach_of(values[rows]), values) for rows in self.train])
+        found = np.stack([in_ranges(channel_ranges(values[rows]), values) for rows in self.train])
         if place is None:
             return found
         pressed = self.train & self.series.loaded
-        return np.asarray(found & np.stack([inside(box_of(place[rows]), place) for rows in pressed]))
+        return np.asarray(found & np.stack([in_box(bounding_box(place[rows]), place) for rows in pressed]))
 
     def inputs(self, way: Way) -> np.ndarray:
         """The channels, and the place if the way takes it."""
         s = self.series
         if not isinstance(way, WithPlace) or s.place is None:
             return s.values
-        return np.column_stack([s.values, relative(self.box, s.place)])
+        return np.column_stack([s.values, box_coordinates(self.box, s.place)])
 
     def signals(self, way: Way) -> tuple[AbstractCombination, np.ndarray]:
         """The combination of all used samples, and the signals (fits, n) of the combinations of each fit."""
         key = _key(way)
         if key not in self._signals:
-            self._signals[key] = self._combined(way)
+            self._signals[key] = self._combine(way)
         return self._signals[key]
 
-    def _combined(self, way: Way) -> tuple[AbstractCombination, np.ndarray]:
+    def _combine(self, way: Way) -> tuple[AbstractCombination, np.ndarray]:
         s, inputs = self.series, self.inputs(way)
         if way is None:
             return one_channel(0), np.broadcast_to(s.values[:, 0], self.train.shape)
@@ -174,67 +183,67 @@ class _Problem:
         key = _key(way), CURVES.name_of(curve), "" if field is None else FIELDS.name_of(field)
         if key not in self._fits:
             combination, signals = self.signals(way)
-            signals = signals_for(curve, signals)
-            fitted, gains, gain, spread = self._fitted(curve, field, signals)
+            signals = filter_signals(curve, signals)
+            fitted, gains, gain, spread = self._fit_candidate(curve, field, signals)
             force, error, _ = curve_forces(fitted, signals)
             error = gain * np.hypot(np.nan_to_num(error), np.nan_to_num(force) * spread)
             valid = self.inside & _in_range(fitted, signals)
             self._fits[key] = _Fits(combination, fitted, gains, gain * force, error, valid)
         return self._fits[key]
 
-    def _fitted(
+    def _fit_candidate(
         self, curve: AbstractCurve, field: AbstractField | None, signals: np.ndarray
     ) -> tuple[FittedCurve, FittedField | None, np.ndarray, np.ndarray]:
         """Curves and fields of all fits, and the gain (fits, n) with the standard deviation of its logarithm."""
         force, gain, spread = self.series.force, np.ones(self.train.shape), np.zeros(self.train.shape)
         options: dict[str, Any] = {"mask": self.train, "groups": self.block, "loss": self.loss}
         fitted, gains = fit_curves(curve, signals, force, **options), None
-        for _ in range(0 if field is None else ROUNDS):
+        for _ in range(0 if field is None else ITERATIONS):
             assert field is not None
-            gains = self._gains(field, curve_forces(fitted, signals)[0])
-            gain, spread = self._at_samples(gains)
+            gains = self._fit_gains(field, curve_forces(fitted, signals)[0])
+            gain, spread = self._sample_gains(gains)
             fitted = fit_curves(curve, signals, force / gain, **options)
         return fitted, gains, gain, spread
 
-    def _gains(self, field: AbstractField, curves: np.ndarray) -> FittedField:
+    def _fit_gains(self, field: AbstractField, curves: np.ndarray) -> FittedField:
         """The fields of the fits, from the force over that of the curves at each place."""
         s = self.series
         assert s.place is not None
         pressed, count = self.used & s.loaded, int(s.sites.max()) + 1
         at = s.sites[pressed]
-        seen = np.maximum(np.bincount(at, minlength=count), 1)
-        place = np.stack([np.bincount(at, one[pressed], count) / seen for one in s.place.T], 1)
-        return fit_gains(field, self.box, place, ratios(s.force, curves, self.train & pressed, s.sites, count))
+        samples = np.maximum(np.bincount(at, minlength=count), 1)
+        place = np.stack([np.bincount(at, one[pressed], count) / samples for one in s.place.T], 1)
+        return fit_gains(field, self.box, place, gain_ratios(s.force, curves, self.train & pressed, s.sites, count))
 
-    def _at_samples(self, gains: FittedField) -> tuple[np.ndarray, np.ndarray]:
+    def _sample_gains(self, gains: FittedField) -> tuple[np.ndarray, np.ndarray]:
         assert self.series.place is not None
-        each = [LogLocation(self.box, _row(gains, k)).gains(self.series.place) for k in range(len(self.train))]
+        each = [LogLocation(self.box, _fit_row(gains, k)).gains(self.series.place) for k in range(len(self.train))]
         return np.stack([gain for gain, _ in each]), np.sqrt(np.stack([variance for _, variance in each]))
 
     def held_out(self, fits: _Fits) -> HeldOut:
         """Each used sample as the fit without its fold predicts it; NaN where that fit failed."""
-        n, good = len(self.fold), fits.good
+        n, succeeded = len(self.fold), fits.succeeded
         found = HeldOut(np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, bool))
         for row in range(1, len(self.train)):
-            if good[row]:
+            if succeeded[row]:
                 _copy(fits, row, self.used & ~self.train[row], found)
         return found
 
     def errors(self, way: Way, curve: AbstractCurve, field: AbstractField | None = None) -> np.ndarray:
         """Mean square held-out errors of the blocks that decide, (blocks,) N^2; NaN if a fit failed."""
         fits = self.fits(way, curve, field)
-        numbers = np.unique(self.block[self.decides])
-        if not fits.good.all():
+        numbers = np.unique(self.block[self.scored])
+        if not fits.succeeded.all():
             return np.full(len(numbers), np.nan)
         square = (self.held_out(fits).force - self.series.force) ** 2
-        return np.array([square[self.decides & (self.block == k)].mean() for k in numbers])
+        return np.array([square[self.scored & (self.block == k)].mean() for k in numbers])
 
 
 def _key(way: Way) -> str:
     return f"{type(way.way).__name__} with place" if isinstance(way, WithPlace) else type(way).__name__
 
 
-def _row(gains: FittedField, row: int) -> FittedField:
+def _fit_row(gains: FittedField, row: int) -> FittedField:
     found: FittedField = jax.tree.map(lambda leaf: leaf[row], gains)
     return found
 
@@ -275,15 +284,17 @@ def fit_series(
     why: list[str] = []
     tried: tuple[Candidate, ...] = ()
     if len(ways) > 1 and series.site is None:
-        (name, *_), said, tried = _choose(problem, ways, [Affine()], fields)
-        why, ways = [said], {name: ways[name]}
-    (name, curve, field), said, table = _choose(problem, ways, curves, fields)
+        (name, *_), reason, tried = _select(problem, ways, [Affine()], fields)
+        why, ways = [reason], {name: ways[name]}
+    (name, curve, field), reason, table = _select(problem, ways, curves, fields)
     fits = problem.fits(ways[name], curve, field)
     _require_success(curve, fits)
-    return _fitted(problem, fits, (ways[name], curve, field), "; ".join(filter(None, [*why, said])), tried + table)
+    return _fitted_log(
+        problem, fits, (ways[name], curve, field), "; ".join(filter(None, [*why, reason])), tried + table
+    )
 
 
-def _choose(
+def _select(
     problem: _Problem,
     ways: Mapping[str, Way],
     curves: Sequence[AbstractCurve],
@@ -291,38 +302,38 @@ def _choose(
 ) -> tuple[tuple[str, AbstractCurve, AbstractField | None], str, tuple[Candidate, ...]]:
     """The best of all ways with all curves and fields; a way that takes the place itself has no field."""
     parts = [part for part, of in (("channels", ways), ("curve", curves), ("location", fields)) if len(of) > 1]
-    listed = []
+    options = []
     for order, (name, way) in enumerate(ways.items()):
         for curve, field in product(curves, (None,) if isinstance(way, WithPlace) else fields):
             at = "none" if field is None else FIELDS.name_of(field)
             names = {"channels": name, "curve": CURVES.name_of(curve), "location": at}
-            size = COST_OF_WAY * order + curve.size
+            size = WAY_PENALTY * order + curve.size
             size += 0.0 if field is None else problem.fits(way, curve, field).effective
-            listed.append(Tried((name, curve, field), ", ".join(names[part] for part in parts), size))
-    return simplest(" and ".join(parts), listed, lambda one: problem.errors(ways[one[0]], *one[1:]), problem.over)
+            options.append(Option((name, curve, field), ", ".join(names[part] for part in parts), size))
+    return simplest(" and ".join(parts), options, lambda one: problem.errors(ways[one[0]], *one[1:]), problem.over)
 
 
 def _require_success(curve: AbstractCurve, fits: _Fits) -> None:
     fitted = fits.curves.pad(0)
     if int(fitted.result) != FitResult.SUCCESS:
         raise FitError(f"the {CURVES.name_of(curve)} curve could not be fitted: {fitted.message()}")
-    if not fits.good[0]:
+    if not fits.succeeded[0]:
         raise FitError("the gain over the place could not be fitted: press more places, or leave the location out")
 
 
-def _fitted(
+def _fitted_log(
     problem: _Problem, fits: _Fits, chosen: tuple[Way, AbstractCurve, AbstractField | None], why: str,
     tried: tuple[Candidate, ...],
 ) -> FittedLog:  # fmt: skip
     series, (way, curve, field), held = problem.series, chosen, problem.held_out(fits)
-    residual = np.where(held.valid & problem.decides, series.force - held.force, np.nan)
+    residual = np.where(held.valid & problem.scored, series.force - held.force, np.nan)
     groups = series.blocks(problem.used, NOISE_BLOCKS)
     used = np.where(problem.used, series.force, np.nan)
-    repetitions = cycles_of(used, series.log) if series.site is None else len(np.unique(series.sites[problem.used]))
+    repetitions = count_cycles(used, series.log) if series.site is None else len(np.unique(series.sites[problem.used]))
     noise = fit_log_noise(residual, series.time, held.force, held.error**2, groups, repetitions)
-    gains = None if fits.gains is None else _row(fits.gains, 0)
+    gains = None if fits.gains is None else _fit_row(fits.gains, 0)
     location = LogLocation(problem.box, gains) if gains is not None or isinstance(way, WithPlace) else None
-    reach = reach_of(series.values[problem.used])
+    reach = channel_ranges(series.values[problem.used])
     travel = travel_of(used, series.log)
     model = LogModel(fits.combination, fits.curves.pad(0), noise, reach, location, travel)
     predicted = with_noise(noise, series.time, fits.force[0], fits.error[0], fits.valid[0])

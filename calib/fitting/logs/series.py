@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from .location import loaded_rows, sites_of
+from .location import cluster_sites, loaded_rows
 
 # Samples of a series that curves are fitted to. Longer series are replaced by means over equal numbers of samples.
 MAX_SAMPLES = 8192
@@ -15,7 +15,7 @@ BLOCKS = 20
 # Seconds between logs on the clock of a series: longer than any memory of a sensor.
 PAUSE = 3600.0
 # Every third place is held out of the fit whose errors are shown.
-HELD_SITES = 3
+HOLD_OUT_STRIDE = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class LogSeries:
     | force  | NaN where missing                                     | (n,)          | N        |
     | log    | number of the log                                     | (n,)          |          |
     | place  | of the contact, by the stage; None: not to be used    | (n, 2)        | m        |
-    | site   | number of the place of contact; see `sites_of`        | (n,)          |          |
+    | site   | number of the place of contact; see `cluster_sites`   | (n,)          |          |
 
     With places, they take the part of the blocks of time: parts that are held out are places.
     """
@@ -50,7 +50,7 @@ class LogSeries:
     def at_places(self) -> "LogSeries":
         """The series with its places told apart."""
         assert self.place is not None
-        return replace(self, site=sites_of(self.place, self.force))
+        return replace(self, site=cluster_sites(self.place, self.force))
 
     @property
     def loaded(self) -> np.ndarray:
@@ -61,7 +61,7 @@ class LogSeries:
     @property
     def fitted_part(self) -> np.ndarray:
         """Flags (n,) of what is fitted to measure errors: the first half in time, or two of three places."""
-        return self.first_half if self.site is None else np.asarray(self.site % HELD_SITES != 0)
+        return self.first_half if self.site is None else np.asarray(self.site % HOLD_OUT_STRIDE != 0)
 
     @property
     def complete(self) -> np.ndarray:
@@ -114,7 +114,7 @@ def series_of(
     most: int = MAX_SAMPLES,
     places: Sequence[Float[np.ndarray, "n 2"]] | None = None,
 ) -> LogSeries:
-    """One series of the logs (time ns, values, force), each thinned by the same factor to about `most` samples.
+    """One series of the logs (time ns, values, force), each averaged by the same factor to about `most` samples.
 
     Args:
         places: of the contacts of each log, m.
@@ -123,32 +123,32 @@ def series_of(
     parts, end = [], 0.0
     for number, (time, values, force) in enumerate(logs):
         at = np.asarray(time - time[0], float)
-        t, v, f = thinned(at, values, force, factor)
-        where = np.full((len(t), 2), np.nan) if places is None else _at_times(at, places[number], t)
-        parts.append((t + end, v, f, np.full(len(t), number), where))
+        t, v, f = block_means(at, values, force, factor)
+        place = np.full((len(t), 2), np.nan) if places is None else _nearest_places(at, places[number], t)
+        parts.append((t + end, v, f, np.full(len(t), number), place))
         end = parts[-1][0][-1] + 1e9 * PAUSE
-    at, values, force, log, where = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return LogSeries(at, values, force, log, None if places is None else where)
+    at, values, force, log, place = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return LogSeries(at, values, force, log, None if places is None else place)
 
 
-def _at_times(time: np.ndarray, place: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _nearest_places(time: np.ndarray, place: np.ndarray, at: np.ndarray) -> np.ndarray:
     """The place (m, 2) of the sample that is nearest to each time: a mean would lie between two places."""
     right = np.clip(np.searchsorted(time, at), 1, max(len(time) - 1, 1)) if len(time) > 1 else np.zeros(len(at), int)
     nearest = np.where(at - time[right - 1] < time[right] - at, right - 1, right)
     return np.asarray(place[nearest])
 
 
-def thinned(
+def block_means(
     time: np.ndarray, values: np.ndarray, force: np.ndarray, factor: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Means over each `factor` samples in turn: of those that are complete or, where none is, of the channels alone."""
     if factor <= 1:
         return time, values, force
-    whole = np.isfinite(values).all(1)
-    both = whole & np.isfinite(force)
+    known = np.isfinite(values).all(1)
+    complete = known & np.isfinite(force)
     start = np.arange(0, len(time), factor)
-    some = np.repeat(np.logical_or.reduceat(both, start), np.diff(np.append(start, len(time))))
-    use = np.where(some, both, whole)
+    has_complete = np.repeat(np.logical_or.reduceat(complete, start), np.diff(np.append(start, len(time))))
+    use = np.where(has_complete, complete, known)
     count = np.add.reduceat(use.astype(float), start)
 
     def mean(column: np.ndarray) -> np.ndarray:

@@ -36,7 +36,7 @@ class LogTracker:
         self._model, self._signals = model, model.combination.tracker()
         self._past = np.zeros((0, 0))  # turning points of the signals before the last, (points, histories)
         self._latest: deque[np.ndarray] = deque(maxlen=3)  # the last signals, (histories,) each
-        self._before: _Reading | None = None  # the last one, whose force is final once the next one is known
+        self._previous: _Reading | None = None  # the last one, whose force is final once the next one is known
         self._copies = 1
         self._recent: deque[list[float]] = deque()  # time, force, standard error and validity
 
@@ -44,9 +44,9 @@ class LogTracker:
         self, time: float, values: Float[np.ndarray, " channels"], place: Float[np.ndarray, " 2"] | None = None
     ) -> LogPrediction:
         """Force, standard error, interval and validity of one reading, at a time (ns) that rises."""
-        where = self._model.location
+        location = self._model.location
         at = np.full((1, 2), np.nan) if place is None else place[None]
-        inputs = values[None] if where is None else where.inputs(values[None], at)
+        inputs = values[None] if location is None else location.inputs(values[None], at)
         reading = _Reading(values[None], at, [time, 0.0, 0.0, 0.0])
         self._recent.append(reading.entry)
         self._estimate(self._signals.step(time / 1e9, inputs[0]), reading)
@@ -61,24 +61,24 @@ class LogTracker:
         rows = [reading]
         series = signals[:, None]
         if self._model.curve.curve.path and np.isfinite(signals[0]):
-            series = self._with_past(signals)
-            rows = [row for row in (self._before, reading) if row is not None]
-            self._before = reading
+            series = self._with_turning_points(signals)
+            rows = [row for row in (self._previous, reading) if row is not None]
+            self._previous = reading
         values, place = (np.concatenate(column) for column in list(zip(*rows, strict=True))[:2])
         for row, found in zip(rows, zip(*self._model.forces(series, values, place), strict=True), strict=True):
             row.entry[1:] = map(float, found)
 
-    def _with_past(self, signals: Float[np.ndarray, " histories"]) -> Float[np.ndarray, "more m"]:
+    def _with_turning_points(self, signals: Float[np.ndarray, " histories"]) -> Float[np.ndarray, "more m"]:
         """The signals after the turning points of each history.
 
-        A reading becomes part of the past as the median of three (`signals_for`), once the next one is known.
+        A reading becomes part of the past as the median of three (`filter_signals`), once the next one is known.
         """
         if not self._latest:
-            begun = self._model.with_starts(signals[:, None])
-            self._copies = len(begun) // len(signals)
-            self._past = remembered(begun[:, :-1].T)
+            extremes = self._model.with_extreme_histories(signals[:, None])
+            self._copies = len(extremes) // len(signals)
+            self._past = remembered(extremes[:, :-1].T)
         self._latest.append(np.tile(signals, self._copies))
         if len(self._latest) > 1:
-            settled = median_of_three(*self._latest) if len(self._latest) > 2 else self._latest[0]
-            self._past = remembered(np.concatenate([self._past, settled[None]]))
+            filtered = median_of_three(*self._latest) if len(self._latest) > 2 else self._latest[0]
+            self._past = remembered(np.concatenate([self._past, filtered[None]]))
         return np.concatenate([self._past, self._latest[-1][None]]).T

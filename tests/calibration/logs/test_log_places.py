@@ -8,7 +8,7 @@ from calib.calibration.logs.procedure import calibrate_logs, evaluate_log
 from calib.cli import main
 from calib.fitting.curves import Affine, MonotonePolynomial
 from calib.fitting.fields import GaussianProcess, PadEdge, RadialBasis, TensorSpline
-from calib.fitting.logs.location import box_of, sites_of
+from calib.fitting.logs.location import bounding_box, cluster_sites
 from calib.fitting.results import FitError
 from calib.session import SessionError, open_session, read_archive
 
@@ -140,9 +140,9 @@ def test_too_few_places_and_walls_that_a_log_does_not_have(tmp_path):
 def test_presses_at_one_place_are_told_from_those_at_others():
     place = np.array([[0, 0], [1, 0], [1, 0.001], [0.5, 0.5], [0, 1], [0, 0.01]]) * SIDE
     force = np.array([5.0, 5.0, 5.0, 0.01, 5.0, 5.0])
-    site = sites_of(place, force)
+    site = cluster_sites(place, force)
     assert site[1] == site[2] == site[3]
     assert site[0] == site[5]
     assert len(set(site)) == 3
-    line = box_of(np.array([[0.0, 0.0], [1.0, 0.0]]))
+    line = bounding_box(np.array([[0.0, 0.0], [1.0, 0.0]]))
     np.testing.assert_allclose(line[1] - line[0], [1.0, 0.1])
