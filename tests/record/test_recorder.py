@@ -369,8 +369,11 @@ def test_plans_must_be_sound():
             replace(PLANNED, streams=streams)
     with pytest.raises(PlanError, match="not known"):
         StreamPlan("smell", 1)
-    with pytest.raises(PlanError, match="above zero"):
+    with pytest.raises(PlanError, match=r"tick 0.0 s; give 1e-12 to 1e3 s"):
         replace(eit, tick=0.0)
+    for field in ("rate", "scale", "offset", "tick"):
+        with pytest.raises(PlanError, match=f"{field} nan; give a finite number"):
+            replace(eit, **{field: float("nan")})
     with pytest.raises(PlanError, match="title: is a text that cannot be stored; use at most 262,144 bytes of Unicode"):
         replace(PLANNED, title="\udcff")  # as a name of a file may be
     with pytest.raises(PlanError, match="transport: is a text that cannot be stored"):
