@@ -38,19 +38,25 @@ def force_shares(
 ) -> Float[np.ndarray, " places"]:
     """Force that arrives on the elements of the mesh over that which arrives on the sheet, of a tip at each place.
 
+    It is zero for a load so narrow that no point of the integral feels it.
+
     Args:
+        places: of tips, on the sheet, m.
         diameter: of the tip, m.
     """
     distance = np.geomspace(NEAREST, FARTHEST, DISTANCES)
     turn = 2 * np.pi * (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS  # none along an edge of the sheet
     rays = np.stack([np.cos(turn), np.sin(turn)], -1)
     offset = (distance[:, None, None] * rays).reshape(-1, 2)
-    step = np.log(distance[1] / distance[0])
-    # the area of a ring is an integral of 2 pi r^2 over the logarithm of r
-    area = np.repeat(2 * np.pi / DIRECTIONS * distance**2 * step, DIRECTIONS)
-    inside = np.array([domain.contains(place + offset) for place in places])
+    radius, step = np.repeat(distance, DIRECTIONS), np.log(distance[1] / distance[0])
+    area = 2 * np.pi / DIRECTIONS * radius**2 * step  # the area of a ring is an integral over the logarithm of r
+    inside = np.ones((len(places), len(offset)), bool)
+    for row, place, free in zip(inside, places, domain.boundary_distance(places), strict=True):
+        far = radius >= free  # nearer points lie on the sheet, as the place does
+        row[far] = domain.contains(place + offset[far])
     at, tip, points, areas = (jnp.asarray(given, model.dtype) for given in (places, diameter, offset, area))
-    return np.asarray(_shares(model, at, tip, points, areas, jnp.asarray(inside)))
+    shares = np.asarray(_shares(model, at, tip, points, areas, jnp.asarray(inside)))
+    return np.where(np.isfinite(shares), shares, 0.0)
 
 
 @eqx.filter_jit

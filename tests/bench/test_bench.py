@@ -528,9 +528,10 @@ def test_a_data_set_is_shared_out_over_devices(tmp_path):
     np.testing.assert_array_equal(*found)
 
 
-def test_a_load_between_the_elements_is_refused(tmp_path):
+@pytest.mark.parametrize("width", [2e-4, 1e-12])
+def test_a_load_between_the_elements_is_refused(width, tmp_path):
     """The force of the stage would be whole, and the skin would feel none of it."""
-    scene = je.Scene(je.load_skin("testbed"), effects=(je.effects.LoadSpreading(width=2e-4),))
+    scene = je.Scene(je.load_skin("testbed"), effects=(je.effects.LoadSpreading(width=width),))
     bench = Bench(scene, np.array([[0.05, 0.05], [0.15, 0.06]]), np.array([5.0]))
     with pytest.raises(BenchError, match=r"% of the force of a tip of 0.02 m arrives on the mesh.* finer fidelity"):
         simulate(bench, tmp_path / "s.h5", fidelity=je.Fidelity.draft())
