@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from calib.check.eit.reading_order import predict_readings
+from calib.check.eit.model import SkinModel
+from calib.check.eit.reading_order import transfer_matrix
 from calib.check.eit.untouched import UntouchedCheck
 from calib.check.report import Severity
 from calib.live.loop import LiveControl, LiveSettings, run_live
@@ -22,10 +23,9 @@ def untouched(skin):
 
 
 @pytest.fixture(scope="module")
-def honest(skin, untouched):
+def honest(skin):
     """A frame of the testbed with an uneven coat, about."""
-    scan = skin.protocol
-    frame = scan.current * predict_readings(untouched._transfer, scan.pattern)
+    frame = SkinModel.of(skin, transfer_matrix(skin)).predict(skin.protocol)
     return frame * (1 + 0.1 * np.random.default_rng(0).normal(size=len(frame)))
 
 

@@ -4,10 +4,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+import jaxeit as je
+
 from ..report import ChannelTable
 from .reading_order import OrderCheck, check_order, predict_readings
 
+MIN_SOUND_READINGS = 10  # for a comparison with the model
 ROUNDING = 1e-6  # of the largest voltage: some roundings of single precision, in which the model is solved
+
+
+def are_enough(good: np.ndarray) -> bool:
+    """Whether so many readings are sound, of flags (readings,), that a frame can be compared with the model."""
+    return bool(good.sum() >= max(MIN_SOUND_READINGS, len(good) // 4))
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,23 +35,29 @@ class SkinModel:
     positions: np.ndarray
     usual: np.ndarray
 
+    @classmethod
+    def of(cls, skin: je.Skin, transfer: np.ndarray, current: float | None = None) -> "SkinModel":
+        """The model of a skin from its transfer matrix; ``current``: A, default that of its protocol."""
+        current = skin.protocol.current if current is None else current
+        return cls(transfer, current, skin.electrode_positions, skin.protocol.pairs)
+
     @property
     def rounding(self) -> float:
         """Voltage (V) below which a predicted reading, a difference of large ones, may be rounding alone."""
         return ROUNDING * self.current * float(np.abs(self.transfer).max(initial=0.0))
 
-    def predict(self, table: ChannelTable) -> np.ndarray:
+    def predict(self, scan: ChannelTable | je.skin.Protocol) -> np.ndarray:
         """Readings (readings,) of the uniform sheet, V."""
-        return self.current * predict_readings(self.transfer, table.pattern, table.mixing)
+        return self.current * predict_readings(self.transfer, scan.pattern, scan.mixing)
 
-    def check(self, voltage: np.ndarray, good: np.ndarray, table: ChannelTable) -> OrderCheck:
+    def check(self, voltage: np.ndarray, good: np.ndarray, scan: ChannelTable | je.skin.Protocol) -> OrderCheck:
         """Compare a frame with the sheet under many orders of its readings: `check_order`."""
         return check_order(
             voltage,
             good,
-            table.pattern,
+            scan.pattern,
             self.transfer,
-            mixing=table.mixing,
+            mixing=scan.mixing,
             current=self.current,
             positions=self.positions,
             usual=self.usual,

@@ -17,7 +17,7 @@ from ..skin import EMPTY_REMEDY, MAX_EMPTY
 from ..streams.statistics import StreamStatistics
 from .contradictions import check_reciprocity, lost_electrode_findings, offset_finding
 from .grouping import common_electrodes, readings_of_electrodes
-from .model import SkinModel
+from .model import MIN_SOUND_READINGS, SkinModel, are_enough
 from .order_findings import MIN_CORRELATION, amplitude_findings, order_findings
 from .reading_order import OrderCheck, transfer_matrix
 from .rests import rest_change, rest_finding
@@ -30,7 +30,6 @@ MIN_SHARED_EXTREMES = 3  # so many readings with one extreme value are at the co
 MAX_EMPTY_FRACTION = 0.25  # of the readings without a value, up to which the others make an image
 MAX_SATURATED_FRACTION = 0.05  # of the readings: those beside the drive may clip without much harm to an image
 MIN_REST_FRAMES, MAX_REST_FRAMES = 8, 2000
-MIN_SOUND_READINGS = 10  # for a comparison with the model
 # Quantile of the changes of the frames, which is that of a touch; and the part of it, and of the model's voltage, below
 # which the frame at rest is none of voltages.
 TOUCHED, MAX_REST = 0.95, 0.3
@@ -83,8 +82,7 @@ def _model(session: Session, skin: je.Skin, transfer: np.ndarray | None, finding
         what = f"the skin {skin.name!r} cannot be modelled: {error}"
         findings.append(Finding(Severity.ERROR, "/device", what, "correct the skin's TOML file"))
         return None
-    current = skin.protocol.current if session.current is None else session.current
-    return SkinModel(transfer, current, skin.electrode_positions, skin.protocol.pairs)
+    return SkinModel.of(skin, transfer, session.current)
 
 
 def _sound(table: ChannelTable) -> np.ndarray:
@@ -93,7 +91,7 @@ def _sound(table: ChannelTable) -> np.ndarray:
 
 def _check_order(table: ChannelTable, good: np.ndarray, model: SkinModel, findings: list[Finding]) -> OrderCheck | None:
     """Compare the good readings (readings,) with a uniform sheet; None if there are too few."""
-    if good.sum() < max(MIN_SOUND_READINGS, len(good) // 4):
+    if not are_enough(good):
         if good.all():
             what = f"a frame has only {len(good)} readings: too few to check their order and signs"
             findings.append(Finding(Severity.OK, "/streams/eit", what, f"scan {MIN_SOUND_READINGS} readings or more"))

@@ -6,9 +6,9 @@ from jaxtyping import Bool, Float
 import jaxeit as je
 
 from ..report import Finding, Severity
+from .model import SkinModel, are_enough
 from .order_findings import AMPLITUDE_RATIO_OF_OTHER_ORDERS, WHERE, amplitude_findings, order_findings
-from .reading_order import check_order, predict_readings, transfer_matrix
-from .readings import MIN_SOUND_READINGS
+from .reading_order import transfer_matrix
 
 
 class UntouchedCheck:
@@ -22,29 +22,19 @@ class UntouchedCheck:
     """
 
     def __init__(self, skin: je.Skin):
-        self._skin, self._transfer = skin, transfer_matrix(skin)
+        self._scan, self._model = skin.protocol, SkinModel.of(skin, transfer_matrix(skin))
 
     def __call__(
         self, untouched: Float[np.ndarray, " readings"], used: Bool[np.ndarray, " readings"]
     ) -> tuple[Finding, ...]:
         """What is wrong with a mean frame without contact, V; nothing where too few readings are used and finite."""
         good = used & np.isfinite(untouched)
-        if good.sum() < max(MIN_SOUND_READINGS, len(good) // 4):
+        if not are_enough(good):
             return ()
-        scan = self._skin.protocol
-        expected = scan.current * predict_readings(self._transfer, scan.pattern, scan.mixing)
-        sizes = [float(np.sqrt(np.mean(part[good] ** 2))) for part in (untouched, expected)]
+        sizes = [float(np.sqrt(np.mean(part[good] ** 2))) for part in (untouched, self._model.predict(self._scan))]
         if sizes[0] < AMPLITUDE_RATIO_OF_OTHER_ORDERS[0] * sizes[1]:
             return (_about_zero(*sizes),)
-        order = check_order(
-            untouched,
-            good,
-            scan.pattern,
-            self._transfer,
-            current=scan.current,
-            positions=self._skin.electrode_positions,
-            mixing=scan.mixing,
-        )
+        order = self._model.check(untouched, good, self._scan)
         return (*order_findings(order), *amplitude_findings(order))
 
 
