@@ -97,10 +97,11 @@ class Registry(Mapping[str, type[T]], Generic[T]):
             raise KeyError(name)
         return self.find(name)
 
-    def find(self, name: str, allow_import: bool = False) -> type[T]:
+    def find(self, name: str, allow_import: bool = False, text: str = "") -> type[T]:
         """The class of a name: a shipped class, an installed class, or one named by its import path.
 
         Args:
+            text: the whole word that the name begins, for messages; default: the name alone.
             allow_import: whether the module of an import path may be imported, which runs its code.  Set it for text
                 that the user wrote, not for text that a session or calibration file holds.
 
@@ -114,25 +115,20 @@ class Registry(Mapping[str, type[T]], Generic[T]):
             return self._checked(_loaded(installed[name], self.kind), name)
         if ":" in name:
             return self._checked(self._by_path(name, allow_import), name)
-        raise RegistryError(f"no {self.kind} {name!r}; {self._hint(name)}")
+        raise RegistryError(f"no {self.kind} {name!r}; {self._hint(name, text or name)}")
 
-    def _hint(self, name: str) -> str:
-        """What may be meant by an unknown name."""
+    def _hint(self, name: str, text: str) -> str:
+        """What may be meant by an unknown name that begins a word: an object of a setting, or a class of this kind."""
+        for own, kind in self.shipped.items():
+            for setting in settings_of(kind, self.parts).values():
+                part = setting.part
+                if isinstance(part, Registry) and name in (*part.names, *part.words):
+                    return f"{name!r} is known as {part.kind}: write '{own}:{setting.name}={text}'"
         module, dot, own = name.rpartition(".")
         names = (*self.names, *self.words)
         known = ", ".join(f'"{known}"' for known in names)
         path = f"write a class of your own as {module + ':' + own!r}"
         return did_you_mean(name, names, path if dot else f"give one of {known}")
-
-    def _hint_of_parts(self, name: str, text: str) -> str:
-        """How to write a name that is one of the objects that settings hold; empty for any other name."""
-        for part in self.parts:
-            if isinstance(part, Registry) and name in (*part.names, *part.words):
-                for own, kind in self.shipped.items():
-                    for setting in settings_of(kind, (part,)).values():
-                        if setting.part is part:
-                            return f"{name!r} is known as {part.kind}: write '{own}:{setting.name}={text}'"
-        return ""
 
     def name_of(self, thing: T | type[T]) -> str:
         """The name of a class or of an object's class; its import path if it is neither shipped nor installed."""
@@ -193,11 +189,8 @@ class Registry(Mapping[str, type[T]], Generic[T]):
             ValueError: for a name or a setting that does not exist, or a value of the wrong kind.
         """
         name, settings = split_word(self.words.get(text, text))
-        if name not in self.names and (hint := self._hint_of_parts(name, text)):
-            raise RegistryError(f"no {self.kind} {name!r}; {hint}")
-        return _made(
-            self.find(name, allow_import), TomlTable(settings, f"{self.kind} {text!r}", allow_import), given, self.parts
-        )
+        kind = self.find(name, allow_import, text)
+        return _made(kind, TomlTable(settings, f"{self.kind} {text!r}", allow_import), given, self.parts)
 
     def read(self, table: TomlTable, **given: Any) -> T:
         """The object that a TOML table describes: ``type`` and its settings.
