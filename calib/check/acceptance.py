@@ -36,7 +36,12 @@ class Acceptance(NamedTuple):
 
 
 def accept(
-    sessions: Sequence[Session], skin: je.Skin | None, *, ignore_errors: bool = False, where: Sequence[str] = ("",)
+    sessions: Sequence[Session],
+    skin: je.Skin | None,
+    *,
+    ignore_errors: bool = False,
+    where: Sequence[str] = ("",),
+    uninformative: bool = True,
 ) -> Acceptance:
     """Check sessions before they are used; returns their warnings, and their errors if errors are ignored, as notes.
 
@@ -45,6 +50,7 @@ def accept(
         ignore_errors: return errors as notes instead of raising.
         where: beginnings of the places in a file that are used, such as "/streams/eit"; default: all. Errors and
             warnings elsewhere do not count.
+        uninformative: return the warnings about channels without information, too.
 
     Raises:
         RecordingError: naming the first error of the first session that has one, and how many more there are.
@@ -75,7 +81,7 @@ def accept(
         name = printable(session.name)
         ignored += [f"{name}: error ignored: {printable(f'{f.where}: {f.what}', 300)}" for f in errors]
         warned = [f for f in findings if f.severity is Severity.WARNING and f.where.startswith(NOTED_PARTS)]
-        warnings += [f"{name}: {_said(f)}" for f in warned]
+        warnings += [f"{name}: {_said(f)}" for f in warned if uninformative or not f.uninformative]
     return Acceptance(tuple(ignored), tuple(warnings))
 
 

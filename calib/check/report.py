@@ -24,12 +24,16 @@ class Severity(enum.IntEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One statement about a recording: ``severity``, ``where`` it applies, ``what`` is the case, and ``remedy``."""
+    """One statement about a recording: ``severity``, ``where`` it applies, ``what`` is the case, and ``remedy``.
+
+    ``uninformative``: the channels, from 0, that carry no information; the calibration of a log leaves them out.
+    """
 
     severity: Severity
     where: str
     what: str
     remedy: str = ""
+    uninformative: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ influence on the choice. The calibration that is kept is the chosen kind of mode
 """
 
 import platform
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,9 +17,8 @@ import jaxeit as je
 from jaxeit.budget import current_budget
 from jaxeit.kinds import require_kind
 
-from ...check.acceptance import Acceptance, accept
+from ...check.acceptance import accept
 from ...check.logs.blocks import NOT_SIGNALS, signal_name
-from ...check.presses.pads import LEFT_OUT
 from ...fitting.curves import CURVES, AbstractCurve
 from ...fitting.fields import FIELDS, AbstractField, PadEdge
 from ...fitting.logs import (
@@ -83,7 +82,7 @@ def calibrate_logs(
         raise SessionError("calibrate_logs: no session given; give one or more logs")
     require_each_once(sessions)
     recipe = recipe_or_default(recipe, "calibrate_logs")
-    accepted = accept(sessions, None, ignore_errors=ignore_errors)
+    accepted = accept(sessions, None, ignore_errors=ignore_errors, uninformative=False)  # `_informative` notes them
     signal = _same_signal(sessions)
     series, locations, placed = _with_places(_series(sessions, recipe), recipe, sessions)
     where = f"{sessions[0].name}: /streams/{signal.name}"
@@ -107,8 +106,7 @@ def calibrate_logs(
             filter(
                 None,
                 [
-                    *accepted.ignored,
-                    *_warnings(accepted),
+                    *accepted.notes,
                     note,
                     placed,
                     thin,
@@ -300,11 +298,6 @@ def stream_of(calibration: LogCalibration, session: Session, call: str) -> Strea
             f"calibration is of {calibration.columns} in {calibration.unit}; give the calibration of this sensor"
         )
     return signal
-
-
-def _warnings(accepted: Acceptance) -> Iterator[str]:
-    """Warnings about the logs of a calibration, but for channels that it leaves out, which it notes itself."""
-    return (line for line in accepted.warnings if not line.endswith(LEFT_OUT))
 
 
 def evaluate_log(calibration: LogCalibration, session: Session, *, ignore_errors: bool = False) -> LogEvaluation:

@@ -15,7 +15,6 @@ from ..streams.statistics import MAX_MISSING, StreamStatistics
 MIN_PRESSURE = 5.0  # Pa; no press is lighter, but bar and kPa recorded as Pa give such numbers
 MAX_BELOW = 0.1  # of the span, by which all values may lie below it
 MAX_REST = 0.8  # of the span, at which a pad may rest
-LEFT_OUT = "the calibration of a log leaves them out"
 # An array of many channels is searched for faults in so many pieces of so many samples, spread over the recording,
 # because the search holds what it reads in memory.
 PIECES, PIECE_LENGTH = 64, 512
@@ -117,22 +116,26 @@ def _array_findings(stats: StreamStatistics, force: Stream | None) -> Iterator[F
     time, values = _pieces(stats.stream)
     reference = None if force is None else resample(force.time, force.read()[:, :1], time)[:, 0]
     found = faults(values, reference)
-    repair = f"check their sensors and wires; {LEFT_OUT}"
-    kinds = {
-        "hold no finite sample (dead)": (found.dead, repair),
-        "have one value in 99 % of the samples (stuck)": (found.stuck, repair),
-        "sit at one end of the range of all for 1 % of the samples (saturated)": (
-            found.saturated,
-            "lower the gain, or press less: the fit of such a channel is wrong there",
+    repair = "check their sensors and wires; the calibration of a log leaves them out"
+    press_less = "lower the gain, or press less: the fit of such a channel is wrong there"
+    kinds = (
+        ("hold no finite sample (dead)", found.dead, repair, True),
+        ("have one value in 99 % of the samples (stuck)", found.stuck, repair, True),
+        ("sit at one end of the range of all for 1 % of the samples (saturated)", found.saturated, press_less, False),
+        ("do not follow the force (silent)", found.silent, repair, True),
+        (
+            "jump away from their neighbours in time and back (spiking)",
+            found.spiking,
+            "check their wires and plugs",
+            False,
         ),
-        "do not follow the force (silent)": (found.silent, repair),
-        "jump away from their neighbours in time and back (spiking)": (found.spiking, "check their wires and plugs"),
-    }
-    for what, (flag, remedy) in kinds.items():
+    )
+    for what, flag, remedy, left_out in kinds:
         columns = np.flatnonzero(flag)
         if len(columns):
             text = f"{len(columns)} of {stats.row.channels} channels {what}: {listed(columns)}"
-            yield Finding(Severity.WARNING, "/streams/pressure", text, remedy)
+            uninformative = tuple(columns.tolist()) if left_out else ()
+            yield Finding(Severity.WARNING, "/streams/pressure", text, remedy, uninformative)
 
 
 def _pieces(stream: Stream) -> tuple[np.ndarray, np.ndarray]:
