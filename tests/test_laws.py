@@ -100,6 +100,18 @@ def test_jaxeit_knows_nothing_of_calib_or_files():
         assert "import h5py" not in path.read_text(), path
 
 
+def test_calib_uses_what_the_rooms_of_jaxeit_offer():
+    """Names of `jaxeit` in calib are those that a package or a module beside the rooms lists or defines as public."""
+    hidden = []
+    for path in (ROOT / "calib").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.level == 0 and (node.module or "").startswith("jaxeit."):
+                module = import_module(node.module)
+                offered = getattr(module, "__all__", () if node.module.count(".") > 1 else dir(module))
+                hidden += [(str(path), node.module, each.name) for each in node.names if each.name not in offered]
+    assert hidden == []
+
+
 def test_only_the_session_package_touches_hdf5():
     users = {_room(p, "calib") for p in (ROOT / "calib").rglob("*.py") if "import h5py" in p.read_text()}
     assert users == {"session"}

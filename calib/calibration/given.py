@@ -3,7 +3,7 @@
 from typing import Any
 
 from jaxeit.kinds import require_kind
-from jaxeit.model.fidelity import require_dtype
+from jaxeit.model import require_dtype
 
 from ..session import SessionError
 from ..session.given import call_on

@@ -5,7 +5,6 @@ from jaxtyping import Float
 
 import jaxeit as je
 from jaxeit.geometry import AbstractSurface, Plane
-from jaxeit.geometry.shapes import cross
 
 _STEP = 1e-5
 """m, of the differences that give tangents: on a radius of 10 mm the direction errs by 1e-7."""
@@ -40,12 +39,4 @@ def normals_in_space(surface: AbstractSurface | None, chart: Float[np.ndarray, "
 
 def pad_centres(skin: je.Skin) -> Float[np.ndarray, "pads 2"]:
     """Centroids of the pads' outlines in the sheet's flat coordinates, m."""
-    return np.array([_centroid(np.asarray(pad.outline, float)) for pad in skin.pads]).reshape(-1, 2)
-
-
-def _centroid(corners: Float[np.ndarray, "corners 2"]) -> Float[np.ndarray, "2"]:
-    """Centroid of a polygon: the mean of the triangles that its sides form with the first corner, by their areas."""
-    sides = corners - corners[0]
-    after = np.roll(sides, -1, 0)
-    doubled = cross(sides, after)
-    return np.asarray(corners[0] + doubled @ (sides + after) / (3 * doubled.sum()))
+    return np.array([pad.polygon.centroid for pad in skin.pads]).reshape(-1, 2)

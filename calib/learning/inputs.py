@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxeit.contacts.loads.learned.proposal import components, standardised
+from jaxeit.contacts.loads.learned import components, standardised
 
 from ..bench import TrainingFrames
 

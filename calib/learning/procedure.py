@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxeit as je
-from jaxeit.contacts.loads.learned.proposal import SHAPES, WEIGHTS, Proposal, pad_inputs
+from jaxeit.contacts.loads.learned import SHAPES, WEIGHTS, Proposal, pad_inputs
 from jaxeit.skin import skin_hash
 
 from ..batch.digests import digest

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from scipy.optimize import minimize_scalar
 
 from jaxeit.contacts import LoadKind, Proposed
-from jaxeit.contacts.loads.learned.proposal import loads_by_kind
+from jaxeit.contacts.loads.learned import loads_by_kind
 
 from .targets import Targets
 

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxeit.contacts import LoadKind, LoadSettings
-from jaxeit.contacts.search import MIN_RELATIVE_STRENGTH
+from jaxeit.contacts import MIN_RELATIVE_STRENGTH, LoadKind, LoadSettings
 
 from ..bench import Footprint, TrainingFrames
 

@@ -15,7 +15,7 @@ import optax
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from jaxeit.contacts import LoadKind
-from jaxeit.contacts.loads.learned.proposal import KINDS, LAYERS, PARAMETERS, SHAPES, loads_by_kind
+from jaxeit.contacts.loads.learned import KINDS, LAYERS, PARAMETERS, SHAPES, loads_by_kind
 
 from ..bench import BenchError
 from ..session import replacing

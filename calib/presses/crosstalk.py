@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxeit as je
-from jaxeit.linalg.lapack import solve
+from jaxeit.linalg import solve
 
 from .streams import robust_deviation
 

@@ -18,11 +18,13 @@ Example:
     reference = (je.Fidelity.draft(edge_length=0.05), je.Fidelity.draft(edge_length=0.04))
     table = je.ladder(scene, rungs, touches=[touch], reference=reference, budget=0.01)
     print(table.table(width=80))
+    front = accuracy.undominated(table.fidelities(), lambda r: (r.difference_error, r.forward.median))
+    print("no other is both faster and more accurate:", [rung.choice.label for rung in front])
     best = table.recommend(error=0.5)
     print(f"{best.choice.label}: error {best.difference_error:.1%}, {1e3 * best.forward.median:.1f} ms")
 """
 
-from .recommendation import Ladder, Rung
+from .recommendation import Ladder, Rung, undominated
 from .settings import (
     Choice,
     LadderError,
@@ -43,4 +45,5 @@ __all__ = [
     "fidelity_choices",
     "image_choices",
     "ladder",
+    "undominated",
 ]

@@ -25,6 +25,7 @@ Example:
         if present:
             print(f"at {1e3 * place[0]:.1f}, {1e3 * place[1]:.1f} mm, {1e3 * width:.1f} mm wide")
     print("the strongest one at", je.contacts.strongest(found))  # m
+    print(f"contacts of less than {je.contacts.MIN_RELATIVE_STRENGTH:.0%} of its strength do not count")
     print(je.contacts.ContactResult(int(found.result[0])).name)
     je.plot.show_contacts(found, je.plot.show_skin(skin)).figure.savefig("contacts.png")
 """
@@ -48,10 +49,11 @@ from .preparation import prepare_contacts
 from .refinement import refine_contacts
 from .regions import RegionError, Regions, find_regions
 from .result import ContactResult, Contacts, strongest
-from .search import ContactFinder
+from .search import MIN_RELATIVE_STRENGTH, ContactFinder
 from .settings import ContactSettings
 
 __all__ = [
+    "MIN_RELATIVE_STRENGTH",
     "AbstractGain",
     "ContactFinder",
     "ContactResult",

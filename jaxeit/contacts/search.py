@@ -26,8 +26,8 @@ from .fit import ContactFit, FitState, FrameResponse, contact_rows
 from .result import ContactResult, Contacts
 from .starts import Atoms, observed_lengths, split_strongest
 
-# Least strength of a contact, over that of the strongest. A weaker one is a ripple of the strongest.
 MIN_RELATIVE_STRENGTH = 0.1
+"""Least strength of a contact, over that of the strongest. A weaker one is a ripple of the strongest."""
 # Horizon of extrapolation, in steps: a further fit is given up if so many more falls, each as its last step promised,
 # would not make it good enough.
 FALL_HORIZON = 16

@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from ..budget import require
@@ -293,6 +293,15 @@ class Polygon(_Polygonal):
     @cached_property
     def corner_points(self) -> np.ndarray:
         return np.array(self.vertices)
+
+    @property
+    def centroid(self) -> Float[np.ndarray, "2"]:
+        """Centroid, m: the mean of the triangles that the sides form with the first corner, by their areas."""
+        first = self.corner_points[0]
+        sides = self.corner_points - first
+        after = np.roll(sides, -1, 0)
+        doubled = cross(sides, after)
+        return np.asarray(first + doubled @ (sides + after) / (3 * doubled.sum()))
 
 
 def as_points(points: ArrayLike) -> np.ndarray:

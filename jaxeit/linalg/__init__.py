@@ -16,13 +16,18 @@ Example:
     pattern = linalg.SparsityPattern(n, rows, cols)
     values = jnp.concatenate([jnp.full(n, 2.1), jnp.full(n - 1, -1.0)])
     load = jnp.ones((n, 1))
-    solve = je.verb(linalg.solve_spd)
+    solve_spd = je.verb(linalg.solve_spd)
     for solver in (linalg.Dense(), linalg.NestedDissection(), linalg.ConjugateGradient()):
         plan = solver.analyse(pattern)  # once, on the host
-        x = solve(solver, plan, values, load)  # as often as needed, also under vmap and grad
+        x = solve_spd(solver, plan, values, load)  # as often as needed, also under vmap and grad
         left = jnp.abs(linalg.matvec(plan, values, x) - load).max()
         print(f"{linalg.SOLVERS.text(solver)}: {left:.1e} left of the load")
     print(je.Fidelity.draft(solver=linalg.default_solver(n)))
+
+    stack = jnp.eye(3) + 0.1 * jnp.arange(1.0, 5.0)[:, None, None]  # small matrices, safe under vmap
+    eigenvalues, vectors = jax.vmap(linalg.eigh)(stack)
+    singular = jax.vmap(lambda a: linalg.svd(a)[1])(stack)
+    print(eigenvalues[:, ::-1] - singular, jax.vmap(linalg.solve, (0, None))(stack, jnp.ones(3)))
 """
 
 from ..registry import Registry
@@ -30,6 +35,7 @@ from .base import AbstractLinearSolver, AbstractPlan, PatternError, SparsityPatt
 from .conjugate_gradient import ConjugateGradient, Single
 from .covariance import is_covariance
 from .dense import Dense
+from .lapack import eigh, solve, svd
 from .nested_dissection import NestedDissection
 
 __all__ = [
@@ -43,10 +49,13 @@ __all__ = [
     "Single",
     "SparsityPattern",
     "default_solver",
+    "eigh",
     "inverse_columns",
     "is_covariance",
     "matvec",
+    "solve",
     "solve_spd",
+    "svd",
 ]
 
 

@@ -11,6 +11,7 @@ Example:
     skin = je.load_skin("testbed")
     effects = (je.effects.LoadSpreading(), je.effects.ContactPiezoresistance())
     fidelity = je.Fidelity.draft()
+    je.model.require_dtype(fidelity.dtype)  # float64, for which JAX must be in 64-bit mode
     print(je.model.expected_mesh_nodes(skin, fidelity), "nodes")
     model = je.discretise(je.Scene(skin, effects), fidelity)
 
@@ -35,7 +36,7 @@ from .bases import (
     Pixels,
 )
 from .discretisation import Model, discretise, expected_mesh_nodes, make_mesh
-from .fidelity import Fidelity, FidelityError
+from .fidelity import Fidelity, FidelityError, require_dtype
 from .forward_model import CoatedSheet, DerivativeError, conductivity, forward, load_spread, rounding
 from .motion import Motion, MotionError, electrode_motion, moved, shift_jacobian
 from .pneumatics import pad_response
@@ -74,6 +75,7 @@ __all__ = [
     "moved",
     "pad_response",
     "read_effects",
+    "require_dtype",
     "rounding",
     "shift_jacobian",
 ]

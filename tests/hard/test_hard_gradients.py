@@ -87,6 +87,7 @@ HOST = {
     "reciprocal_rows": _DESCRIBES,
     "rim_electrodes": _DESCRIBES,
     "refine_contacts": _PREPARES,
+    "require_dtype": _DESCRIBES,
     "cache_programs": _DESCRIBES,
     "limit_blas_threads": _DESCRIBES,
     "reuse_memory": _DESCRIBES,
@@ -102,6 +103,7 @@ HOST = {
     "structured": _GEOMETRY,
     "to_numbers": _DESCRIBES,
     "triangulate": _GEOMETRY,
+    "undominated": "compares rows of a table, on the host",
     "trigonometric": _DESCRIBES,
     "AbstractSurface": _GEOMETRY,
     "Cylinder": _GEOMETRY,
@@ -128,6 +130,7 @@ HOST = {
     ),
     **dict.fromkeys(["computed", "fold", "history", "history_start", "keys", "parameter"], _INNER),
     **dict.fromkeys(["inverse_columns", "matvec", "normal_equations", "quadratic", "solve_spd"], _INNER),
+    **dict.fromkeys(["eigh", "solve", "svd"], _INNER),
 }
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxeit.tracking import GainField, LearnedLayer
-from jaxeit.tracking.belief.layer import PRESS_VARIANCES
+from jaxeit.tracking.belief import PRESS_VARIANCES
 
 from ..archives.arrays import shaped
 

@@ -6,7 +6,7 @@ import numpy as np
 
 import jaxeit as je
 from jaxeit.contacts import LoadSettings
-from jaxeit.contacts.loads.sheet import scaled_law
+from jaxeit.contacts.loads import scaled_law
 
 from ..calibration import Calibration
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 import jaxeit as je
 from jaxeit.contacts import LoadKind, Loads, LoadSettings, Proposal
-from jaxeit.contacts.loads.pressure import MAX_LOADS
+from jaxeit.contacts.loads import MAX_LOADS
 from jaxeit.registry import SettingError
 
 from ...presses.streams import finite_mean

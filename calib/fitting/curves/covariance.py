@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxeit.linalg.lapack import eigh, svd
+from jaxeit.linalg import eigh, svd
 
 from .problem import CurveProblem, residuals
 

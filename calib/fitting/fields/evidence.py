@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxeit.linalg.lapack import eigh, solve
+from jaxeit.linalg import eigh, solve
 
 # Sizes of the prior: variance of a coefficient over the variance of the noise. The smallest allows no visible field,
 # the largest leaves the coefficients to the presses; four sizes per decade.

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from jaxeit.accuracy.recommendation import undominated
+from jaxeit.accuracy import undominated
 
 from .parts import bare_figure, plain_numbers
 

@@ -4,11 +4,13 @@ from .fitter import LoadFitter
 from .learned.learning import learn_loads
 from .learned.proposal import Proposal, load_proposal, shipped_proposal
 from .preparation import prepare_loads
+from .pressure import MAX_LOADS
 from .result import LoadKind, Loads, LoadShape, Proposed
 from .settings import ForceLaw, LoadSettings
-from .sheet import AbstractGain
+from .sheet import AbstractGain, scaled_law
 
 __all__ = [
+    "MAX_LOADS",
     "AbstractGain",
     "ForceLaw",
     "LoadFitter",
@@ -21,5 +23,6 @@ __all__ = [
     "learn_loads",
     "load_proposal",
     "prepare_loads",
+    "scaled_law",
     "shipped_proposal",
 ]

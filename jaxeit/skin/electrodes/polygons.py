@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ...geometry.shapes import Domain, Polygon, cross
+from ...geometry.shapes import Domain, Polygon
 from ...meshing.elements import Space
 from ...meshing.outlines import PolygonFootprint
 from ...meshing.smoothing import doubled_areas
@@ -59,10 +59,7 @@ class PolygonPatch(AbstractAreaElectrode):
         return inside
 
     def centre(self, domain: Domain) -> np.ndarray:
-        corners = self.outline.corner_points
-        after = np.roll(corners, -1, 0)
-        weight = cross(corners - corners[0], after - corners[0])
-        return np.asarray((weight @ (corners[0] + corners + after)) / (3 * weight.sum()))
+        return self.outline.centroid
 
     @classmethod
     def read(cls, table: TomlTable, domain: Domain) -> tuple["PolygonPatch", ...]:
