@@ -1,7 +1,7 @@
 """The paper's data set: voltages of Gaussian contacts on a grid of places, at a range of amplitudes."""
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import jax
@@ -18,7 +18,9 @@ from .simulation import Progress
 
 FORMAT = "skin-dataset"
 CONTACTS_PER_DEVICE = 64  # contacts that are sent to a device at a time
-SOLVE_BATCH = 8  # contacts that are solved together
+# Contacts that are solved together. From `jaxeit.linalg.batches.MIN_BATCH` on, a solve takes a quarter to a half of the
+# time, but the program takes twice as long to compile, which pays only for many contacts.
+FEW_TOGETHER, MANY_TOGETHER, MANY = 8, 32, 1000
 
 
 def grid(skin: je.Skin, columns: int = 41, rows: int = 41) -> Float[np.ndarray, "places 2"]:
@@ -60,32 +62,33 @@ def simulate_contacts(
     out = np.empty((len(at), model.readings), model.dtype)
     split, whole = NamedSharding(devices, P("contacts")), NamedSharding(devices, P())
     model, spread = jax.device_put((model, jnp.asarray(width, model.dtype)), whole)
-    sigma = je.conductivity(model)
+    sigma, solver = je.conductivity(model), _sharded_solver(devices, MANY_TOGETHER if len(at) >= MANY else FEW_TOGETHER)
     for start in progress(range(0, len(at), piece)):
         rows = np.minimum(np.arange(start, start + piece), len(at) - 1)
         batch = np.column_stack([places[at[rows]], size[rows]]).astype(model.dtype)
-        voltages = _sharded_solver(devices)(model, sigma, spread, jax.device_put(batch, split))
+        voltages = solver(model, sigma, spread, jax.device_put(batch, split))
         out[start : start + piece] = np.asarray(voltages)[: len(at) - start]
     return out.reshape(len(places), len(amplitudes), -1)
 
 
 @cache
-def _sharded_solver(devices: Mesh) -> Callable[..., Array]:
+def _sharded_solver(devices: Mesh, together: int) -> Callable[..., Array]:
     # Without the check of replication, because loops in the solver start from constants, which the check takes for
     # equal on all devices.
     specs = (P(), P(), P(), P("contacts"))
-    solved = jax.shard_map(_solve_contacts, mesh=devices, in_specs=specs, out_specs=P("contacts"), check_vma=False)
+    solve = partial(_solve_contacts, together=together)
+    solved = jax.shard_map(solve, mesh=devices, in_specs=specs, out_specs=P("contacts"), check_vma=False)
     return jax.jit(solved, compiler_options=je.compiler_options())
 
 
 def _solve_contacts(
-    model: je.Model, sigma: Array, width: Array, batch: Float[Array, "n 3"]
+    model: je.Model, sigma: Array, width: Array, batch: Float[Array, "n 3"], *, together: int
 ) -> Float[Array, "n readings"]:
     def frame(contact: Array) -> Array:
         square = jnp.sum((model.centroids - contact[:2]) ** 2, -1)
         return je.forward(model, sigma * (1 + contact[2] * jnp.exp(-0.5 * square / width**2)))
 
-    found: Float[Array, "n readings"] = jax.lax.map(frame, batch, batch_size=SOLVE_BATCH)
+    found: Float[Array, "n readings"] = jax.lax.map(frame, batch, batch_size=together)
     return found
 
 
