@@ -1,4 +1,4 @@
-"""Forward solves with 64 contacts in one call, every tool in one run; BLAS has one thread, XLA all cores."""
+"""Forward solves with 64 contacts in one call, every tool in one run; BLAS has one thread, others all cores."""
 
 from .comparison import Comparison, factorisation
 from .harness import Question, with_one_blas_thread
@@ -12,7 +12,7 @@ def work(problem: Problem, image: str) -> dict[str, float]:
     return {name: CONTACTS * value for name, value in factorisation(problem).items()}
 
 
-BATCHES = Comparison("batch", superlu.NAME, "voltages", work, repeats=5, largest=60)
+BATCHES = Comparison("batch", superlu.NAME, "voltages", work, repeats=5, largest=120)
 main = Question("batch", __doc__, {"rows": BATCHES})
 
 if __name__ == "__main__":

@@ -110,6 +110,15 @@ def jacobian_work(problem: Problem, image: str) -> Row:
     }
 
 
+def gradient_work(problem: Problem, image: str) -> Row:
+    """The factorisation, one substitution, slopes of 25 fields and their product with the weights of pairs."""
+    factor, fields, nodes, elements = factorisation(problem), 25, len(problem.mesh.nodes), len(problem.sigma)
+    return {
+        "flops": factor["flops"] + 4 * fields * factor["entries"] + 2 * elements * fields * (6 + 2 * fields + 2),
+        "bytes": factor["bytes"] + 8 * (factor["entries"] + 2 * fields * nodes + elements),
+    }
+
+
 def inverse_work(problem: Problem, image: str) -> Row:
     """That of the Jacobian, and of a symmetric product, a Cholesky factor and two triangular solves for 300 numbers."""
     work, k = jacobian_work(problem, image), 300

@@ -47,7 +47,7 @@ class Agreement(NamedTuple):
 
 def ratios(rows: Sequence[Row]) -> Iterator[tuple[str, Ratio]]:
     """Every tool over our float64 one on the same work: as many nodes, and onto the same image."""
-    ours = {(row["nodes"], _image(row)): row for row in rows if row["tool"].split(",")[0] == OURS}
+    ours = {(r["nodes"], _image(r)): r for r in rows if r["tool"] in (OURS, f"{OURS}, {_image(r)}")}
     for row in rows:
         mine = ours.get((row["nodes"], _image(row)))
         if mine is not None and mine is not row:
@@ -57,7 +57,8 @@ def ratios(rows: Sequence[Row]) -> Iterator[tuple[str, Ratio]]:
 
 
 def _image(row: Row) -> str:
-    return row["tool"].rpartition(", ")[2] if "," in row["tool"] else ""
+    end = row["tool"].rpartition(", ")[2]
+    return end if end in ("pixels", "elements") else ""
 
 
 def compared(first: Sequence[Row], second: Sequence[Row]) -> list[Agreement]:

@@ -14,6 +14,7 @@ from calib.calibration.localisation.press_images import REPORTED_ESTIMATORS
 from .markdown import all_columns, cell, crossed, markdown, plain, replaced
 from .repeat import compared
 from .rows import Row, averaged, grouped
+from .tools import CONTACTS
 
 FORMATS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
@@ -76,20 +77,47 @@ def _evaluation(summary: Row) -> Iterator[Row]:
 
 SPEED = {
     ("forward", "jaxeit float64"): "forward, jaxeit",
+    ("forward", "jaxeit float64, called from Python"): "forward, jaxeit, called from Python",
+    ("forward", "jaxeit float64, without compiler options"): "forward, jaxeit, in your own `jax.jit`",
     ("forward", "CHOLMOD by hand"): "forward, CHOLMOD driven by hand",
     ("forward", "SuperLU by hand"): "forward, SuperLU driven by hand",
     ("forward", "EIDORS"): "forward, EIDORS",
     ("forward", "pyEIT"): "forward, pyEIT",
+    ("gradient", "jaxeit float64"): "gradient of a loss, jaxeit",
+    ("gradient", "jaxeit float64, without compiler options"): "gradient of a loss, jaxeit, in your own `jax.jit`",
+    ("gradient", "adjoint by hand"): "gradient of a loss, adjoint formula by hand",
     ("jacobian", "jaxeit float64, pixels"): "Jacobian onto 900 pixels, jaxeit",
+    ("jacobian", "jaxeit float64, without compiler options, pixels"): (
+        "Jacobian onto 900 pixels, jaxeit, in your own `jax.jit`"
+    ),
     ("jacobian", "adjoint by hand, pixels"): "Jacobian onto 900 pixels, adjoint formula by hand",
     ("jacobian", "EIDORS, pixels"): "Jacobian onto 900 pixels, EIDORS",
 }
 
 
-def _speed(forward: Row, jacobian: Row) -> list[Row]:
-    """Forward solves and Jacobians onto pixels, by tool and mesh."""
-    runs = {"forward": forward["rows"], "jacobian": jacobian["rows"]}
-    return [row | {"tool": label} for (kind, tool), label in SPEED.items() for row in runs[kind] if row["tool"] == tool]
+COMPILED = {("forward", "jaxeit float64"), ("gradient", "jaxeit float64"), ("jacobian", "jaxeit float64, pixels")}
+
+
+def _runs(forward: Row, jacobian: Row) -> dict[str, list[Row]]:
+    return {"forward": forward["rows"], "jacobian": jacobian["rows"], "gradient": jacobian.get("gradient_rows", [])}
+
+
+def _speed(forward: Row, jacobian: Row) -> Iterator[Row]:
+    """Forward solves, gradients and Jacobians onto pixels, by tool and mesh; then what ours take to compile."""
+    runs = _runs(forward, jacobian)
+    for (kind, tool), label in SPEED.items():
+        yield from (row | {"tool": label} for row in runs[kind] if row["tool"] == tool)
+    for kind, tool in SPEED:
+        compiled = (row for row in runs[kind] if row["tool"] == tool and (kind, tool) in COMPILED)
+        yield from (
+            row | {"tool": f"first call with compilation: {SPEED[kind, tool]}", "median_ms": 1e3 * row["first_call_s"]}
+            for row in compiled
+        )
+
+
+def _batches(results: Row) -> list[Row]:
+    """Solutions a second of each tool."""
+    return [row | {"per_s": 1e3 * CONTACTS / row["median_ms"]} for row in results["rows"]]
 
 
 def _gpu_batches(results: Row, larger: Row) -> Iterator[Row]:
@@ -330,6 +358,7 @@ def _live(results: Row) -> Iterator[Row]:
 ROWS: dict[str, Callable] = {
     "evaluation": _evaluation,
     "speed": _speed,
+    "batches": _batches,
     "onto": _onto,
     "gpu_batches": _gpu_batches,
     "gpu_verbs": _gpu_verbs,

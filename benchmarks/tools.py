@@ -20,6 +20,7 @@ import jaxeit as je
 from .clock import MAX_DIFFERENCE, Tool, seconds
 from .peers import adjoint, cholmod, eidors, pyeit, superlu
 from .problems import Problem
+from .processes import InProcesses
 
 PIXELS = 30
 HYPERPARAMETER = 0.1
@@ -144,12 +145,41 @@ def onto(name: str, prepare: Callable[..., Tool], *rest: Any, elements: int = 24
     return pixels, Entry(f"{name}, elements", partial(prepare, pixels=False), *rest, largest=elements, **more)
 
 
+def jacobian_inside(problem: Problem, pixels: bool) -> Tool:
+    """As part of a program that was not given `je.compiler_options`."""
+    model = problem.model()
+    return as_tool(compiled(je.jacobian, model, basis_of(model, pixels)))
+
+
 JACOBIAN = (
     *onto("jaxeit float64", jacobian, elements=120),  # beyond, the matrix alone takes 1.3 GB
+    onto("jaxeit float64, without compiler options", jacobian_inside)[0],
     onto("jaxeit float32", partial(jacobian, dtype="float32"), loose=MAX_FLOAT32_DIFFERENCE)[0],
     *onto(adjoint.NAME, jacobian_by_hand, elements=120),
     Entry(f"{pyeit.NAME}, elements", pyeit.prepare_jacobian, pyeit, 30),  # it inverts a dense matrix
     *onto(eidors.NAME, partial(by_eidors, verb="jacobian"), eidors, elements=120),
+)
+
+
+# --- gradients of a loss
+
+
+def loss(model: je.Model, sigma: jax.Array) -> jax.Array:
+    """Half the sum of squares of the voltages."""
+    return 0.5 * jnp.sum(je.forward(model, sigma) ** 2)
+
+
+def gradient(problem: Problem, dtype: str = "float64", *, options: bool = True) -> Tool:
+    """The gradient of `loss`, in V^2/S."""
+    run = compiled(jax.grad(loss, 1), problem.model(dtype), options=je.compiler_options() if options else None)
+    return as_tool(run, dtype)
+
+
+GRADIENT = (
+    Entry("jaxeit float64", gradient),
+    Entry("jaxeit float32", partial(gradient, dtype="float32"), loose=MAX_FLOAT32_DIFFERENCE),
+    Entry("jaxeit float64, without compiler options", partial(gradient, options=False)),
+    Entry(adjoint.NAME, adjoint.prepare_gradient),
 )
 
 
@@ -283,12 +313,20 @@ def batched(problem: Problem, batch: int, dtype: str = "float64") -> Tool:
     return lambda sigma: tool(shapes * sigma)
 
 
-def one_by_one(prepare: Callable[[Problem], Tool]) -> Callable[[Problem], Tool]:
-    def looped(problem: Problem) -> Tool:
-        tool, shapes = prepare(problem), contacts(problem)
-        return lambda sigma: np.stack([tool(one) for one in shapes * sigma])
+def share(prepare: Callable[[Problem], Tool], cells: int, number: int, count: int) -> Tool:
+    """The tool for one of ``count`` equal shares of the contacts."""
+    problem = Problem(cells)
+    tool, shapes = prepare(problem), np.array_split(contacts(problem), count)[number]
+    return lambda sigma: np.stack([tool(one) for one in shapes * sigma])
 
-    return looped
+
+def one_by_one(prepare: Callable[[Problem], Tool]) -> Callable[[Problem], Tool]:
+    return lambda problem: share(prepare, problem.cells, 0, 1)
+
+
+def in_processes(prepare: Callable[[Problem], Tool]) -> Callable[[Problem], Tool]:
+    """A tool in as many processes as there are cores, each with its share of the contacts at hand."""
+    return lambda problem: InProcesses(partial(share, prepare, problem.cells))
 
 
 BATCH = (
@@ -301,6 +339,14 @@ BATCH = (
     ),
     Entry(superlu.NAME, one_by_one(superlu.prepare), superlu),
     Entry(cholmod.NAME, one_by_one(cholmod.prepare), cholmod),
+    Entry(f"{cholmod.NAME}, forward substitution only, all cores", in_processes(cholmod.prepare_substituted), cholmod),
 )
 
-TOOLS = {"forward": FORWARD, "jacobian": JACOBIAN, "inverse": INVERSE, "pipeline": PIPELINE, "batch": BATCH}
+TOOLS = {
+    "forward": FORWARD,
+    "jacobian": JACOBIAN,
+    "gradient": GRADIENT,
+    "inverse": INVERSE,
+    "pipeline": PIPELINE,
+    "batch": BATCH,
+}

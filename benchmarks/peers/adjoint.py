@@ -9,6 +9,32 @@ from .assembly import gradients
 NAME = "adjoint by hand"
 
 
+def prepare_gradient(problem):
+    """Of half the sum of squares of the voltages, from the fields of all electrodes.
+
+    ``- area sum_ab C_ab grad u_a . grad u_b``, where C adds each voltage to the pairs of electrodes it comes from.
+    """
+    forward = (superlu if cholmod.missing() else cholmod).prepare(problem)
+    slopes, triangles, rows = gradients(problem.mesh), problem.mesh.triangles, problem.electrode_nodes
+    pairs = [(problem.pattern[:, sense], problem.pattern[:, drive]) for sense in (2, 3) for drive in (0, 1)]
+    signs = (1, -1, -1, 1)
+
+    def gradient(sigma):
+        x = forward.fields(sigma)
+        voltages = forward.readings(x[rows])
+        weight = np.zeros((len(rows), len(rows)))
+        for (sense, drive), sign in zip(pairs, signs, strict=True):
+            np.add.at(weight, (sense, drive), sign * voltages)
+        weight = 0.5 * (weight + weight.T)
+        out = np.zeros(len(sigma))
+        for g in slopes:
+            along = np.einsum("ei,eia->ea", g, x[triangles])
+            out -= np.einsum("ea,ea->e", along @ weight, along)
+        return out
+
+    return gradient
+
+
 def prepare(problem, pixels: csr_array | None = None):
     """Onto elements, or through ``pixels`` (elements, basis), drive by drive in bounded memory."""
     forward = (superlu if cholmod.missing() else cholmod).prepare(problem)

@@ -33,7 +33,10 @@ class DirectForward:
         return x
 
     def __call__(self, sigma: np.ndarray) -> np.ndarray:
-        z = self._solve(sigma)[self.rows]
+        return self.readings(self._solve(sigma)[self.rows])
+
+    def readings(self, z: np.ndarray) -> np.ndarray:
+        """Voltages of the protocol, from potentials of electrodes per ampere into each, (electrodes, electrodes)."""
         source, sink, plus, minus = self.problem.pattern.T
         return z[plus, source] - z[minus, source] - z[plus, sink] + z[minus, sink]
 
