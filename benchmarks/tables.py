@@ -165,6 +165,16 @@ def _gpu_training(results: Row) -> str:
     )
 
 
+def _two_fingers(loads: Row, tracking: Row) -> Iterator[Row]:
+    """How often two equal contacts are told apart in one frame, by what the fit assumes, and by a tracker."""
+    single = {row["touch"]: row for row in loads["round"]}
+    followed = {row["scene"]: row for row in tracking["scenes"]}
+    for distance in (0.015, 0.02, 0.03):
+        sequence = followed[f"two in sequence, {1e3 * distance:.0f} mm"]
+        frame = single[f"two, 1:1, {1e3 * distance:.0f} mm"]
+        yield {"distance": distance, "in_sequence": sequence["told"], "kept": sequence["kept"]} | frame
+
+
 def _onto(results: Row) -> list[Row]:
     """Tools onto "pixels" and "elements", which say so in full."""
     return [row | {"tool": re.sub(", (?=pixels|elements)", ", onto ", row["tool"])} for row in results["rows"]]
@@ -360,6 +370,7 @@ ROWS: dict[str, Callable] = {
     "speed": _speed,
     "batches": _batches,
     "onto": _onto,
+    "two_fingers": _two_fingers,
     "gpu_batches": _gpu_batches,
     "gpu_verbs": _gpu_verbs,
     "gpu_frames": _gpu_frames,
