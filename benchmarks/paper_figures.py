@@ -7,6 +7,9 @@ Figure 8 shows two contacts that come and go one by one: force over time, its er
 (`two_contacts` and `chest_two_contacts`): press 1, press 2, release 1, release 2, some with both tips on one pad, the
 others on neighbouring ones.  The calibration is of single presses on a grid over the same sheet, as a bench makes them:
 it has seen no second contact.  A contact's force is that of the contact that was followed there (`apply --track`).
+
+moving: the same for contacts that move (scenes `sliding` and `rolling`, on the testbed): place and force over time of
+one stroke each, and errors over all strokes, in frames in which the tip has half of its load or more.
 """
 
 import tempfile
@@ -24,6 +27,7 @@ from calib.bench.motion import loads_at, planned_motion
 from calib.calibration import Calibration
 from calib.report.figures.curved_sheet import curved_figure
 from calib.report.figures.force_series import ForceSeries, force_series_figure
+from calib.report.figures.moving_contact import WITHIN, Stroke, moving_contact_figure
 from calib.report.figures.parts import write_figure
 from calib.report.figures.presses import localisation_figure, sensitivity_figure
 from calib.runtime import set_up
@@ -33,6 +37,7 @@ from .rows import Row
 
 PICTURES = ROOT / "docs" / "figures"
 SCENES = {"testbed": ("paper_bench", "two_contacts"), "chest": ("chest_bench", "chest_two_contacts")}
+MOVING = {"sliding": "a tip drawn 50 mm over the sheet in 2 s", "rolling": "a roller, 24 mm long, rolled 40 mm in 2 s"}
 SIDE, MARGIN = 9, 0.01  # of the grid of presses that figure 8 is calibrated on; m
 CASES = ("two contacts on one pad", "a contact on each of two pads")
 EVENTS = ("press 1", "press 2", "release 1", "release 2")
@@ -76,7 +81,8 @@ def force_map(bench: Bench, folder: Path, fidelity: je.Fidelity, smoke: bool) ->
     forces as large as both tips have together."""
     ends = np.transpose(bench.scene.skin.domain.bounds)
     x, y = (np.linspace(low + MARGIN, high - MARGIN, 4 if smoke else SIDE) for low, high in ends)
-    changes: Row = {"companions": (), "forces": np.array([25.0]), "eit_rate": 10.0, "toml": "", "seed": bench.seed + 1}
+    changes: Row = {"companions": (), "slide": (0.0, 0.0), "forces": np.array([25.0]), "tip_diameter": 0.02}
+    changes |= {"eit_rate": 10.0, "toml": "", "seed": bench.seed + 1}
     alone = replace(bench, sites=np.stack(np.meshgrid(x, y), -1).reshape(-1, 2), **changes)
     calibration = calibrated(simulate(alone, folder / "alone.h5", fidelity=fidelity), fidelity)
     bench = replace(bench, eit_rate=10.0) if smoke else bench
@@ -129,7 +135,79 @@ def by_frame(forces: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return place, force
 
 
-main = Question("paper_figures", __doc__, {"figures": measure}, prepare=set_up)
+# --- contacts that move
+
+
+def measure_moving(run: Run) -> Iterator[Row]:
+    fidelity = je.Fidelity.draft() if run.smoke else je.Fidelity.standard()
+    shown, rows = [], []
+    for name, title in run.sizes(list(MOVING.items()), list(MOVING.items())[1:]):
+        bench = load_bench(name)
+        with tempfile.TemporaryDirectory() as folder:
+            forces = force_map(bench, Path(folder), fidelity, run.smoke)
+        strokes = [stroke(title, bench, forces, number) for number in range(len(bench.sites))]
+        shown.append(strokes[0])
+        rows.append({"scene": name, "strokes": len(strokes)} | errors_of(strokes))
+    if not run.smoke:
+        write_figure(moving_contact_figure(shown, simulated=True), PICTURES / "testbed-moving.png")
+    yield {"moving": rows}
+
+
+def stroke(title: str, bench: Bench, forces: dict[str, np.ndarray], number: int) -> Stroke:
+    """A press of a bench with a slide, and the strongest contact that is followed in each frame of it; places from
+    where it begins."""
+    motion, start = planned_motion(bench), bench.blank + number * bench.period
+    every = forces["time"] / 1e9
+    rows = (every >= start + 0.2) & (every < start + bench.period - 0.2)
+    load = loads_at(motion, every[rows])
+    slide = np.array(bench.slide)
+    tips = motion.places[number] + load.progress[..., None] * slide
+    share = load.load / np.maximum(load.load.sum(1, keepdims=True), 1e-9)
+    along = slide / np.linalg.norm(slide)
+    axes = np.stack([along, [-along[1], along[0]]])
+    first = motion.places[number].mean(0)
+    true = np.column_stack([1e3 * (np.einsum("tk,tkd->td", share, tips) - first) @ axes.T, load.load.sum(1)])
+    true[true[:, 2] == 0, :2] = np.nan
+    place, covariance, force, error = (part[rows] for part in strongest(forces))
+    turned = np.einsum("ai,nij,aj->na", axes, covariance, axes)
+    estimated = np.column_stack([1e3 * (place - first) @ axes.T, force])
+    return Stroke(title, every[rows] - start, true, estimated, np.column_stack([1e3 * np.sqrt(turned), error]))
+
+
+def strongest(forces: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
+    """Place (n, 2), its covariance (n, 2, 2), force (n,) and its error (n,) of the strongest contact of each frame."""
+    frame = np.searchsorted(forces["time"], forces["tracks/time"])
+    order = np.argsort(forces["tracks/force"], kind="stable")  # the strongest is written last
+    found = []
+    for name in ("position", "position_covariance", "force", "force_se"):
+        part = forces[f"tracks/{name}"]
+        out = np.full((len(forces["time"]), *part.shape[1:]), np.nan)
+        out[frame[order]] = part[order]
+        found.append(out)
+    return tuple(found)
+
+
+def errors_of(strokes: list[Stroke]) -> Row:
+    """Root mean squares of the errors of place and force, and how many places an ellipse's axes of 90 % hold."""
+    true, estimated, deviation = (
+        np.concatenate([getattr(one, name) for one in strokes]) for name in ("true", "estimated", "deviation")
+    )
+    pressed = true[:, 2] >= 0.5 * np.nanmax(true[:, 2])
+    followed = pressed & np.isfinite(estimated).all(1)
+    off = (estimated - true)[followed]
+    inside = np.abs(off) < WITHIN * deviation[followed]
+    return {
+        "followed": float(followed.sum() / pressed.sum()),
+        "place_rms_mm": round(float(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, 1)))), 3),
+        "force_rmse_n": round(float(np.sqrt(np.mean(off[:, 2] ** 2))), 3),
+        "along_covered": float(inside[:, 0].mean()),
+        "across_covered": float(inside[:, 1].mean()),
+        "force_covered": float(inside[:, 2].mean()),
+    }
+
+
+PARTS = {"figures": measure, "moving": measure_moving}
+main = Question("paper_figures", __doc__, PARTS, prepare=set_up)
 
 if __name__ == "__main__":
     main()

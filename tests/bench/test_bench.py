@@ -371,7 +371,7 @@ def test_presets_are_benches(name):
 
 
 def test_every_preset_asked_for_is_there():
-    on_testbed = {"ideal", "paper_bench", "sliding", "two_contacts", "hot_day", "broken_electrode"}
+    on_testbed = {"ideal", "paper_bench", "rolling", "sliding", "two_contacts", "hot_day", "broken_electrode"}
     assert on_testbed | {"chest_bench", "chest_two_contacts"} <= set(presets())
 
 

@@ -1,5 +1,6 @@
 """Honest recordings are not accused: simulated sessions of all scenes, and real logs of others."""
 
+import dataclasses
 from datetime import UTC, datetime
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 import jaxeit as je
 from benchmarks.bench_real import insole_counts
-from calib.bench import simulate
+from calib.bench import load_bench, presets, simulate
 from calib.check import Severity, check_session, transfer_matrix
 from calib.cli import main
 from calib.session import SessionFacts, StreamFacts, open_session
@@ -45,6 +46,20 @@ def test_an_honest_session_is_not_accused(number, transfers, tmp_path):
 
 def test_a_quick_honest_session_is_not_accused(transfers, tmp_path):
     test_an_honest_session_is_not_accused(3, transfers, tmp_path)
+
+
+TOUCHED = [name for name in presets() if name != "ideal"]  # whose readings never change
+SHIPPED = [name if name == "sliding" else pytest.param(name, marks=pytest.mark.slow) for name in TOUCHED]
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_scene_is_not_accused(name, transfers, tmp_path):
+    """At lower rates. The strokes of `sliding` end on the pad under the site five rows later."""
+    bench = dataclasses.replace(load_bench(name), eit_rate=10.0, pad_rate=50.0)
+    path = simulate(bench, tmp_path / "s.h5", fidelity=je.Fidelity.draft(edge_length=0.05))
+    with open_session(path) as session:
+        report = check_session(session, transfer=transfers[bench.scene.skin.name])
+    assert report.ok, [f for f in report.findings if f.severity is Severity.ERROR]
 
 
 def real(name):

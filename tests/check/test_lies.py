@@ -646,14 +646,15 @@ def test_a_lie_is_named(lie, honest, findings, hard):
     hard(f"lie: {lie}", f"`check`: {severity.name.lower()}", beyond=named[0])
 
 
-def found_by_pads(skin, site, pressure):
-    """What is said of pressures (24, pads) of presses of 10 N at places (24, 2)."""
+def found_by_pads(skin, site, pressure, arriving=None):
+    """What is said of pressures (24, pads) of presses of 10 N at places (24, 2), and of those while they arrive."""
     numbers = np.arange(24)
     held = {
         "number": numbers,
         "site": site,
         "force": np.full(24, 10.0),
         "pressure": pressure,
+        "arriving": 0.5 * pressure if arriving is None else arriving,
         "tip_diameter": np.zeros(24),
         "times": numbers * SECOND,
     }
@@ -669,6 +670,15 @@ def test_pressures_that_are_late_by_a_press_are_named(skin):
     for rows, said in ((1, "1 press late: 100% of"), (-2, "2 presses early: 100% of")):
         (found,) = found_by_pads(skin, site, np.roll(pressure, rows, 0))
         assert f"the pads respond {said} the presses so moved" in found.what
+
+
+def test_tips_that_slide_onto_the_pad_of_the_next_press_are_not_late(skin):
+    site = np.array([[0.05, 0.05], [0.15, 0.05], [0.05, 0.15], [0.15, 0.15]])[np.arange(24) // 2 % 4]
+    arriving = np.where(pads_under(skin, site).T, 400.0, 5.0)
+    held = 2 * np.roll(arriving, -1, 0)
+    assert found_by_pads(skin, site, held, arriving) == []
+    (found,) = found_by_pads(skin, site, held, 0.5 * held)
+    assert "the pads respond 1 press early" in found.what
 
 
 def test_a_pad_that_dies_is_named_where_pads_beside_it_bear_a_part(skin):

@@ -56,7 +56,7 @@ def pad_response_findings(evidence: PressEvidence, skin: je.Skin, start: int) ->
         yield from _silent_findings(evidence, skin, response, np.where(known, -1, alone), unfelt)
     falling = [*_falling_findings(evidence, skin, strongest, largest, start)]
     yield from falling
-    late = [] if falling else [*_late_findings(evidence, alone, size)]
+    late = [] if falling or _arrives(evidence, alone) else [*_late_findings(evidence, alone, size)]
     yield from late
     if under.size and not falling and not late:
         yield from _order_findings(evidence, skin, alone, np.nan_to_num(pressure), strongest, start)
@@ -163,6 +163,13 @@ def _late_findings(evidence: PressEvidence, alone: np.ndarray, size: np.ndarray)
         )
         remedy = "compare the clock of the pressures with the others, and move its time stamps at import"
         yield Finding(Severity.ERROR, PRESSURE, what, remedy)
+
+
+def _arrives(evidence: PressEvidence, alone: np.ndarray) -> bool:
+    """Whether the listed pads respond first, as under tips that slide onto other pads; streams that are late do not
+    show it."""
+    arriving = evidence.arriving
+    return arriving is not None and _agreement(alone, np.abs(np.nan_to_num(arriving)), 0) >= MIN_LATE_SHARE
 
 
 def _agreement(alone: np.ndarray, size: np.ndarray, rows: int) -> float:
