@@ -50,14 +50,26 @@ def add_tracking_arguments(parser: argparse.ArgumentParser, text: str) -> None:
     """The options that follow contacts from frame to frame."""
     parser.add_argument("--track", action="store_true", help=text)
     add_settings_argument(parser, "--tracker", "as --track, with settings of jaxeit.tracking.TrackerSettings", "most=5")
+    text = "with --track: the gain of the contact layer stays as the calibration has it; by default contacts teach it"
+    parser.add_argument("--no-learn", action="store_true", help=text)
 
 
 def tracking_of(args: argparse.Namespace) -> "bool | je.tracking.TrackerSettings":
-    """Whether contacts are followed; with the settings of the options, or the usual ones."""
+    """Whether contacts are followed; with the settings of the options, or the usual ones.
+
+    Raises:
+        ValueError: if an option is about contacts that are not followed, or a setting cannot be.
+    """
     from jaxeit.tracking import TrackerSettings
 
     settings = settings_of_option(args, "tracker", TrackerSettings)
-    return bool(args.track) if settings is None else settings
+    if settings is None and not args.track:
+        if args.no_learn:
+            raise ValueError("--no-learn: it is about contacts that are followed; add --track, or leave it out")
+        return False
+    if args.no_learn:
+        return dataclasses.replace(settings or TrackerSettings(), learn=False)
+    return True if settings is None else settings
 
 
 def count(text: str) -> int:

@@ -267,7 +267,8 @@ class LiveRecalibrator:
     def _moved(self) -> Calibration:
         """The calibration with all that is known now."""
         layer = None if self._layer is None else self._layer()
-        found = self._calibration if layer is None else replace(self._calibration, layer=layer)
+        taught = layer is not None and layer.contacts
+        found = replace(self._calibration, layer=layer) if taught else self._calibration
         if self.record is None:
             return found
         return replace(found, recalibration=self.record, notes=(*self._calibration.notes, self.record.health))

@@ -31,6 +31,7 @@ class TrackerSettings:
     | gain_rate: change of the log of the gain during a press, within what was known of it before | 0.1 | 1/sqrt(s) |
     | birth_rate: of contacts anywhere on the skin                                   | 0.5     | 1/s       |
     | most: contacts followed at once                                                | 3       |           |
+    | learn: whether contacts teach the gain of the contact layer; otherwise it stays as at the start | True | |
     | unknowns: of the mesh around a contact that are solved anew in each frame      | 96      |           |
     | modes: of the gain around a contact that a frame updates                       | 24      |           |
     | columns: pixels along x of the first order; None: three to the usual width of a load | None |      |
@@ -52,6 +53,7 @@ class TrackerSettings:
     gain_rate: float = limited(0.1, least=0)
     birth_rate: float = limited(0.5, above=0)
     most: int = limited(3, least=1)
+    learn: bool = True
     unknowns: int = limited(96, least=1)
     modes: int = limited(24, least=1)
     columns: int | None = limited(None, least=1, whole=True)
@@ -66,5 +68,7 @@ class TrackerSettings:
         fidelity = "an object, such as je.Fidelity.draft()"
         require_kind(self.fidelity, Fidelity, InverseError, "a fidelity", fidelity, where)
         require_limits(self, InverseError)
+        if not isinstance(self.learn, bool):
+            raise InverseError(f"{where}: learn is {self.learn!r}; give True or False")
         if self.dtype not in PRECISIONS:
-            raise InverseError(f"TrackerSettings: dtype is {self.dtype!r}; give {' or '.join(map(repr, PRECISIONS))}")
+            raise InverseError(f"{where}: dtype is {self.dtype!r}; give {' or '.join(map(repr, PRECISIONS))}")

@@ -104,14 +104,20 @@ class Tracker:
         return Belief(put(np.zeros((0, CONTACT_SIZE))), put(layer.mean), put(covariance), put(level))
 
     def learned(self, now: Tracking) -> LearnedLayer:
-        """What contacts have told of the gain of the contact layer up to now, to `start` with another time."""
-        if now.begun == now.taught:
+        """What contacts have told of the gain of the contact layer up to now, to `start` with another time.
+
+        It is the layer of the start if contacts are not to teach it (`TrackerSettings.learn`).
+        """
+        if not self._settings.learn or now.begun == now.taught:
             return now.layer
         found = now.layer.told(now.belief.gain, now.belief.covariance, now.begun - now.taught)
         return found if (np.abs(found.mean) <= MAX_GAIN).all() else found.restarted()
 
     def _learn_after_lift(self, now: Tracking) -> Tracking:
-        """Learn the gain of the layer once all contacts have lifted: the next press has an effect of its own."""
+        """Learn the gain of the layer once all contacts have lifted: the next press has an effect of its own.
+
+        A layer that is not to learn stays, and what this press bent of the gain is dropped.
+        """
         if now.numbers or now.backlog is not None or now.begun == now.taught:
             return now
         layer = self.learned(now)

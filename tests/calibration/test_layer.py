@@ -279,6 +279,7 @@ def test_live_goes_on_with_the_layer_and_writes_it(calibration, tracker, layer, 
     LiveRecalibrator(known, tmp_path / "live.h5", layer=follower.learned).save()
     assert calib.load_calibration(tmp_path / "live.h5").layer.contacts == layer.contacts + CONTACTS
     LiveRecalibrator(calibration, tmp_path / "nothing.h5").save()
+    LiveRecalibrator(calibration, tmp_path / "nothing.h5", layer=lambda: LearnedLayer.unknown(layer.field)).save()
     assert not (tmp_path / "nothing.h5").exists()
 
 

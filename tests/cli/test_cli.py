@@ -299,6 +299,8 @@ def test_a_scene_served_as_a_device(presses_file, tmp_path):
         (["--tracker", "most=0"], "TrackerSettings: most is 0; give at least 1, a whole number"),
         (["--tracker", "mots=5"], "--tracker mots=5: mots: unknown key; did you mean 'most'?"),
         (["--tracker", "5"], "--tracker 5: 5: unknown key; known: acceleration"),
+        (["--no-learn"], "--no-learn: it is about contacts that are followed; add --track"),
+        (["--tracker", "learn=no"], "learn"),
         (["--loads", "1", "--load-settings", "width=12"], "LoadSettings: width is 12 m"),
         (["--load-settings", "width=0.01"], "--load-settings: it is about fits of loads; add --loads"),
         (["--loads", "1", "--round-tips", "--load-settings", "width=0.01"], "give one of them"),
@@ -323,6 +325,13 @@ def test_settings_of_contacts_reach_apply_and_live(tmp_path, monkeypatch):
     parser = argparse.ArgumentParser()
     live_command.add_arguments(parser)
     live = ["--calibration", "c.h5", "--pressure", "p"]
-    follow = {(): False, ("--track",): True, ("--tracker", "most=4"): TrackerSettings(most=4)}
+    follow = {
+        (): False,
+        ("--track",): True,
+        ("--tracker", "most=4"): TrackerSettings(most=4),
+        ("--track", "--no-learn"): TrackerSettings(learn=False),
+        ("--tracker", "most=4,learn=false"): TrackerSettings(most=4, learn=False),
+        ("--tracker", "most=4", "--no-learn"): TrackerSettings(most=4, learn=False),
+    }
     for more, track in follow.items():
         assert live_command._settings(parser.parse_args([*live, *more])).track == track

@@ -65,7 +65,7 @@ SETTINGS = {
     je.imaging.RegionSettings: je.imaging.InverseError,
 }
 """Classes of settings, and the error that each raises."""
-OTHERS = {"outside", "loads", "fidelity", "dtype", "law", "forces", "prior"}
+OTHERS = {"outside", "loads", "fidelity", "dtype", "law", "forces", "prior", "learn"}
 """Settings that are no number, or may be below zero."""
 
 
@@ -101,6 +101,7 @@ def test_every_number_of_these_settings_has_limits(kind, name):
         (je.contacts.LoadSettings, {"prior": (0.5, 0.5)}, r"prior has shape \(2,\)"),
         (je.contacts.LoadSettings, {"law": "hill"}, "'hill' is not a law of pressure"),
         (je.tracking.TrackerSettings, {"dtype": "foo"}, "dtype is 'foo'; give 'float32' or 'float64'"),
+        (je.tracking.TrackerSettings, {"learn": 1}, "learn is 1; give True or False"),
         (je.tracking.TrackerSettings, {"loads": 3}, "int is not what is known of loads"),
         (je.tracking.TrackerSettings, {"fidelity": "draft"}, "'draft' is not a fidelity"),
         (je.imaging.ReferenceSettings, {"shift": 2.0}, "shift is 2 m; give 0 to 1 m"),

@@ -66,6 +66,12 @@ def with_filter(tracker, **settings):
     return Tracker(of_frames, press_filter, tracker.settings, tracker.area, tracker.field)
 
 
+def with_settings(tracker, **settings):
+    """The tracker under other settings, of those that its filters do not hold."""
+    given = replace(tracker.settings, **settings)
+    return Tracker(tracker.filter, tracker.press_filter, given, tracker.area, tracker.field)
+
+
 def in_double_precision(tree):
     """The same, with its numbers in float64."""
     return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tree)

@@ -19,7 +19,7 @@ from jaxeit.tracking.belief.response import Neighbourhood, load_pressure
 from jaxeit.tracking.preparation import with_sheet_errors
 from jaxeit.tracking.tracker import MAX_GAIN, bound_gain
 
-from .conftest import SECONDS, load, with_filter
+from .conftest import SECONDS, load, with_filter, with_settings
 
 STRONGER = 1.3  # the true gain of the layer, everywhere
 FORCES = np.array([10.0, 0.0, 0.0, 0.0])  # N on the pads under a press at (0.05, 0.06) m
@@ -229,6 +229,48 @@ def test_learning_goes_on_where_it_ended(tracker, layer):
     np.testing.assert_allclose(again.mean, layer.mean, rtol=1e-6)
     np.testing.assert_allclose(again.covariance, layer.covariance, atol=1e-7)
     assert again.contacts == layer.contacts
+
+
+def some_layer(field, contacts=7):
+    """A layer that tells something else of each mode, under each variance of the effect of a press."""
+    rng, size = np.random.default_rng(708), len(field.places)
+    half = np.eye(size) - 0.05 * rng.normal(size=(len(PRESS_VARIANCES), size, size))
+    covariances = half @ half.mT / np.linalg.norm(half, 2, axis=(1, 2))[:, None, None] ** 2
+    means = 0.1 * rng.normal(size=(len(PRESS_VARIANCES), size))
+    return LearnedLayer(field, means, covariances, -PRESS_VARIANCES, contacts)
+
+
+def assert_same_layer(found, expected):
+    """Every number is the same, bit by bit."""
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_layer_that_is_not_to_learn_stays_while_contacts_are_followed(tracker, frame_of):
+    frozen, start, pressed = with_settings(tracker, learn=False), some_layer(tracker.field), 0
+    now = frozen.start(start)
+    for force in (0.0, 10.0, 10.0, 0.0, 0.0, 12.0, 12.0, 0.0, 0.0):
+        frame = frame_of([load(0.05, 0.06, max(force, 1e-6))])
+        now = frozen.step(now, frame, SECONDS, FORCES * force / 10 + 1e-9, np.full(4, 0.2))
+        pressed += len(now.tracks)
+        assert_same_layer(now.layer, start)
+        assert_same_layer(frozen.learned(now), start)
+    assert pressed >= 4
+    assert now.begun == now.taught == 2
+    np.testing.assert_array_equal(now.belief.covariance, frozen.start(start).belief.covariance)
+
+
+def test_by_default_a_contact_that_has_lifted_teaches_the_layer(tracker):
+    begin = tracker.start(some_layer(tracker.field))
+    bent = begin.belief._replace(gain=begin.belief.gain + 0.1, covariance=0.5 * begin.belief.covariance)
+    lifted = replace(begin, belief=bent, begun=1)
+    for learn, way in ((True, tracker), (False, with_settings(tracker, learn=False))):
+        found = way._learn_after_lift(lifted)
+        assert found.taught == 1
+        assert found.layer.contacts == begin.layer.contacts + learn
+        assert np.array_equal(found.layer.means, begin.layer.means) is not learn
+        np.testing.assert_array_equal(found.belief.gain, way.start(found.layer).belief.gain)
 
 
 def test_a_layer_has_its_trackers_own_errors_of_sheet_and_mesh(tracker, layer):

@@ -89,6 +89,7 @@ def run(args: argparse.Namespace) -> int:
     from ...live.presentation import Presentation, present
     from ...record.recorder import StopRequest
 
+    settings = _settings(args)
     prepare_outputs(args, "output", "recalibrate")
     calibration = load_calibration(args.calibration)
     plan, sources = _planned(args, calibration)
@@ -103,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
             sources,
             show,
             Presentation(args.host, args.port, args.publish, args.publish_maps, args.output),
-            _settings(args),
+            settings,
             also=also,
             tell=say,
         )
