@@ -6,7 +6,7 @@ import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar, overload
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 if TYPE_CHECKING:
     import jaxeit as je
@@ -52,6 +52,8 @@ def add_tracking_arguments(parser: argparse.ArgumentParser, text: str) -> None:
     add_settings_argument(parser, "--tracker", "as --track, with settings of jaxeit.tracking.TrackerSettings", "most=5")
     text = "with --track: the gain of the contact layer stays as the calibration has it; by default contacts teach it"
     parser.add_argument("--no-learn", action="store_true", help=text)
+    text = "with --track: part of the variance that contacts took from that gain, which an hour gives back; default: 0"
+    parser.add_argument("--forget", type=float, metavar="PART", help=text)
 
 
 def tracking_of(args: argparse.Namespace) -> "bool | je.tracking.TrackerSettings":
@@ -63,12 +65,15 @@ def tracking_of(args: argparse.Namespace) -> "bool | je.tracking.TrackerSettings
     from jaxeit.tracking import TrackerSettings
 
     settings = settings_of_option(args, "tracker", TrackerSettings)
+    changes: dict[str, Any] = {"learn": False} if args.no_learn else {}
+    changes |= {} if args.forget is None else {"forgetting": args.forget}
     if settings is None and not args.track:
-        if args.no_learn:
-            raise ValueError("--no-learn: it is about contacts that are followed; add --track, or leave it out")
+        if changes:
+            option = "--no-learn" if args.no_learn else "--forget"
+            raise ValueError(f"{option}: it is about contacts that are followed; add --track, or leave it out")
         return False
-    if args.no_learn:
-        return dataclasses.replace(settings or TrackerSettings(), learn=False)
+    if changes:
+        return dataclasses.replace(settings or TrackerSettings(), **changes)
     return True if settings is None else settings
 
 

@@ -32,6 +32,7 @@ class TrackerSettings:
     | birth_rate: of contacts anywhere on the skin                                   | 0.5     | 1/s       |
     | most: contacts followed at once                                                | 3       |           |
     | learn: whether contacts teach the gain of the contact layer; otherwise it stays as at the start | True | |
+    | forgetting: part of the variance that contacts have taken from the gain which an hour of use gives back | 0 | |
     | unknowns: of the mesh around a contact that are solved anew in each frame      | 96      |           |
     | modes: of the gain around a contact that a frame updates                       | 24      |           |
     | columns: pixels along x of the first order; None: three to the usual width of a load | None |      |
@@ -40,7 +41,7 @@ class TrackerSettings:
     | dtype: of these solutions; errors of float32 are far below noise               | float32 |           |
 
     Raises:
-        InverseError: for a value out of range.
+        InverseError: for a value out of range, or a layer that is not to learn and to forget.
     """
 
     loads: LoadSettings = field(default_factory=partial(LoadSettings, shape=SHAPE))
@@ -54,6 +55,7 @@ class TrackerSettings:
     birth_rate: float = limited(0.5, above=0)
     most: int = limited(3, least=1)
     learn: bool = True
+    forgetting: float = limited(0.0, least=0, below=1)
     unknowns: int = limited(96, least=1)
     modes: int = limited(24, least=1)
     columns: int | None = limited(None, least=1, whole=True)
@@ -70,5 +72,10 @@ class TrackerSettings:
         require_limits(self, InverseError)
         if not isinstance(self.learn, bool):
             raise InverseError(f"{where}: learn is {self.learn!r}; give True or False")
+        if self.forgetting and not self.learn:
+            raise InverseError(
+                f"{where}: forgetting is {self.forgetting:g}, but a layer that is not to learn stays as it is; "
+                "leave out learn or forgetting"
+            )
         if self.dtype not in PRECISIONS:
             raise InverseError(f"{where}: dtype is {self.dtype!r}; give {' or '.join(map(repr, PRECISIONS))}")

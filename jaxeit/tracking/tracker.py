@@ -51,6 +51,8 @@ MAX_GAIN = 4.0
 MISFIT_GROWTH = 1.3
 # Largest misfit over the squared signal of contacts, with which contacts that moved while frames waited are kept.
 MAX_MISFIT_SHARE = 0.01
+# Time, s, after which a layer that forgets is aged, while nothing touches the skin: ageing takes as long as a frame.
+AGEING_INTERVAL = 60.0
 # Middles of nine equal parts of an edge, over its half length.
 LINE_FRACTIONS = (np.arange(9) - 4) / 4.5
 
@@ -123,6 +125,16 @@ class Tracker:
         layer = self.learned(now)
         return replace(now, belief=self._initial_belief(layer), layer=layer, taught=now.begun)
 
+    def _aged(self, now: Tracking, seconds: float) -> Tracking:
+        """So many seconds later, with the layer aged if nothing touches the skin: a contact begins with its gain."""
+        if not self._settings.forgetting:
+            return now
+        unaged = now.unaged + seconds
+        if unaged < AGEING_INTERVAL or now.numbers or now.backlog is not None:
+            return replace(now, unaged=unaged)
+        layer = now.layer.after_use(unaged, self._settings.forgetting)
+        return replace(now, belief=self._initial_belief(layer), layer=layer, unaged=0.0)
+
     def told_by_pads(
         self, tracks: tuple[Track, ...], pad_errors: Float[ArrayLike, " pads"] | None = None
     ) -> Bool[np.ndarray, " n"]:
@@ -171,7 +183,8 @@ class Tracker:
         if not 0 < seconds < np.inf:
             raise InverseError(f"seconds is {seconds}; give the time since the last frame, above zero")
         observation = Observation(self.frame(dv), self.pads(pad_forces, pad_errors), seconds)
-        return self._completed(self._step(now, observation, whole), observation.pads)
+        now = self._aged(now, seconds)
+        return self._completed(now, self._step(now, observation, whole), observation.pads)
 
     def press(
         self,
@@ -252,11 +265,15 @@ class Tracker:
         if backlog is None:
             return now
         last = backlog.waiting[-1] if backlog.look is None or backlog.waiting else backlog.look.observation
-        return self._completed(self._advance_look(now, backlog), last.pads)
+        return self._completed(now, self._advance_look(now, backlog), last.pads)
 
-    def _completed(self, now: Tracking, pads: Pads) -> Tracking:
-        """What is known after a frame, with the gain bounded and learned, and with consider errors."""
-        return self._with_consider_errors(self._learn_after_lift(bound_gain(now)), pads)
+    def _completed(self, before: Tracking, after: Tracking, pads: Pads) -> Tracking:
+        """What is known after a frame, with the gain bounded and learned, and with consider errors.
+
+        A look ends with what was known some frames ago, and the time of the layer is that of ``before``.
+        """
+        after = replace(after, unaged=before.unaged)
+        return self._with_consider_errors(self._learn_after_lift(bound_gain(after)), pads)
 
     def _with_consider_errors(self, now: Tracking, pads: Pads) -> Tracking:
         """Add errors of contacts by unknown shapes, an unknown coat and errors of the model."""

@@ -54,6 +54,7 @@ class Tracking:
     | faint: for how many frames each has hardly been seen                  |
     | begun: number of contacts so far                                      |
     | taught: number of contacts that the layer holds of those that have begun |
+    | unaged: time, s, for which the layer is still to be aged              |
     | misfit: chi-square of the last frame that was looked into             |
     | since, patience: frames since then, and until a frame like it is looked into again |
     | considered: what unknown shapes and an unknown coat make the contacts err by |
@@ -72,6 +73,7 @@ class Tracking:
     considered: ConsiderErrors = field(default_factory=ConsiderErrors)
     backlog: "Backlog | None" = None
     taught: int = 0
+    unaged: float = 0.0
 
     @property
     def tracks(self) -> tuple[Track, ...]:

@@ -300,6 +300,11 @@ def test_a_scene_served_as_a_device(presses_file, tmp_path):
         (["--tracker", "mots=5"], "--tracker mots=5: mots: unknown key; did you mean 'most'?"),
         (["--tracker", "5"], "--tracker 5: 5: unknown key; known: acceleration"),
         (["--no-learn"], "--no-learn: it is about contacts that are followed; add --track"),
+        (["--forget", "0.1"], "--forget: it is about contacts that are followed; add --track"),
+        (["--track", "--forget", "1"], "TrackerSettings: forgetting is 1; give 0 to less than 1"),
+        (["--track", "--forget", "nan"], "TrackerSettings: forgetting is nan; give 0 to less than 1"),
+        (["--track", "--forget", "-0.1"], "TrackerSettings: forgetting is -0.1; give 0 to less than 1"),
+        (["--track", "--forget", "0.1", "--no-learn"], "forgetting is 0.1, but a layer that is not to learn stays"),
         (["--tracker", "learn=no"], "learn"),
         (["--loads", "1", "--load-settings", "width=12"], "LoadSettings: width is 12 m"),
         (["--load-settings", "width=0.01"], "--load-settings: it is about fits of loads; add --loads"),
@@ -332,6 +337,8 @@ def test_settings_of_contacts_reach_apply_and_live(tmp_path, monkeypatch):
         ("--track", "--no-learn"): TrackerSettings(learn=False),
         ("--tracker", "most=4,learn=false"): TrackerSettings(most=4, learn=False),
         ("--tracker", "most=4", "--no-learn"): TrackerSettings(most=4, learn=False),
+        ("--track", "--forget", "0.2"): TrackerSettings(forgetting=0.2),
+        ("--tracker", "most=4,forgetting=0.3"): TrackerSettings(most=4, forgetting=0.3),
     }
     for more, track in follow.items():
         assert live_command._settings(parser.parse_args([*live, *more])).track == track

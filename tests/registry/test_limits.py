@@ -88,7 +88,7 @@ def test_every_number_of_these_settings_has_limits(kind, name):
             kind(**{name: wrong})
     if not isinstance(usual, tuple):
         with pytest.raises(SETTINGS[kind], match=rf"{kind.__name__}: {name} has shape \(2,\); give one number"):
-            kind(**{name: jnp.full(2, usual or 1)})
+            kind(**{name: jnp.full(2, 1 if usual is None else usual)})
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 import jaxeit as je
 from jaxeit.contacts.loads.settings import LoadSettings
 from jaxeit.imaging import InverseError
-from jaxeit.tracking import GainField, LearnedLayer, prepare_tracker
+from jaxeit.tracking import GainField, LearnedLayer, TrackerSettings, prepare_tracker
 from jaxeit.tracking.belief.apparent_gain import apparent_gain
 from jaxeit.tracking.belief.layer import MAX_FILTER_VARIANCE, OUTLIER_PROBABILITY, PRESS_VARIANCES
 from jaxeit.tracking.belief.programs import MIN_START_DISTANCE
@@ -288,6 +288,60 @@ def test_ageing_leads_back_to_the_prior(layer):
     assert np.linalg.eigvalsh(half.covariance).min() > 0
     with pytest.raises(InverseError, match="give 0 to 1"):
         layer.aged(1.5)
+
+
+def assert_aged(found, start, hours, forgetting):
+    """An Ornstein-Uhlenbeck process about the prior, of variance one and mean zero, for each variance of the effect."""
+    kept, unit = (1 - forgetting) ** hours, np.eye(start.means.shape[1])
+    np.testing.assert_allclose(found.covariances, unit + kept * (start.covariances - unit), atol=1e-13)
+    np.testing.assert_allclose(found.means, np.sqrt(kept) * start.means, atol=1e-13)
+    assert np.linalg.eigvalsh(found.covariances).max() <= 1 + 1e-12
+    assert found.contacts == start.contacts
+
+
+@pytest.mark.parametrize("steps", [1, 6])
+def test_an_hour_of_use_gives_back_a_part_of_the_variance(steps):
+    start = found = some_layer(SMALL)
+    for _ in range(steps):
+        found = found.after_use(3 * 3600.0 / steps, 0.2)
+    assert_aged(found, start, 3, 0.2)
+    simulated, rate = start.covariances[4], -np.log(1 - 0.2)  # dP/dt = -rate (P - 1), by small steps
+    for _ in range(30_000):
+        simulated = simulated - 1e-4 * rate * (simulated - np.eye(8))
+    np.testing.assert_allclose(found.covariances[4], simulated, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "forgetting"), [(-1.0, 0.1), (np.nan, 0.1), (np.inf, 0.1), (1.0, 1.0), (1.0, np.nan)]
+)
+def test_time_and_forgetting_that_cannot_be_are_refused(seconds, forgetting):
+    with pytest.raises(InverseError, match=r"(seconds|forgetting) is .*; give"):
+        some_layer(SMALL).after_use(seconds, forgetting)
+
+
+def test_the_layer_ages_while_nothing_touches_the_skin(tracker):
+    """No time is lost, neither of short frames nor of a contact, and the next contact begins with the layer."""
+    ageing, still = with_settings(tracker, forgetting=0.2), np.zeros(tracker.filter.finder.readings)
+    start = now = ageing.start(some_layer(tracker.field))
+    for _ in range(30):
+        now = ageing.step(now, still, 7.0)
+    assert now.unaged == 21.0
+    assert_aged(now.layer, start.layer, 189 / 3600, 0.2)
+    np.testing.assert_array_equal(now.belief.covariance, ageing.start(now.layer).belief.covariance)
+    np.testing.assert_array_equal(now.belief.gain, ageing.start(now.layer).belief.gain)
+    touched = replace(now, numbers=(1,))
+    assert (ageing._aged(touched, 600.0).layer, ageing._aged(touched, 600.0).unaged) == (now.layer, 621.0)
+    later = ageing._aged(replace(ageing._aged(touched, 600.0), numbers=()), 979.0)
+    assert later.unaged == 0
+    assert_aged(later.layer, start.layer, 1789 / 3600, 0.2)
+
+
+def test_without_forgetting_no_number_of_the_layer_changes(tracker):
+    begin = tracker.start(some_layer(tracker.field))
+    now = tracker.step(begin, np.zeros(tracker.filter.finder.readings), 36_000.0)
+    assert now.layer is begin.layer
+    assert now.unaged == 0
+    assert TrackerSettings().forgetting == 0
 
 
 def test_a_layer_of_another_sheet_is_refused(tracker, layer):

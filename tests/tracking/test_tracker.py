@@ -224,7 +224,11 @@ def test_wrong_frames_are_refused(tracker, given, said):
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"level": 0.0}, {"tail": -0.1}, {"gain_rate": np.nan}, {"most": 0}, {"persistence": np.inf}, {"birth_rate": -1.0}],
+    [
+        *({"level": 0.0}, {"tail": -0.1}, {"gain_rate": np.nan}, {"most": 0}, {"persistence": np.inf}),
+        *({"birth_rate": -1.0}, {"forgetting": -0.1}, {"forgetting": np.inf}, {"forgetting": 1.0}),
+        {"forgetting": 0.1, "learn": False},
+    ],
 )
 def test_wrong_settings_are_refused(wrong):
     with pytest.raises(InverseError, match=next(iter(wrong))):

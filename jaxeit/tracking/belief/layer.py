@@ -39,6 +39,7 @@ MIN_LEARNED_SHARE = 1e-4
 MIN_REMAINING_SHARE = 1e-9
 # Probability of an outlier, a press of none of these variances: it bounds what one press says against any of them.
 OUTLIER_PROBABILITY = 1e-3
+HOUR = 3600.0  # s
 
 
 class GainField(eqx.Module):
@@ -259,6 +260,24 @@ class LearnedLayer(AbstractGain):
             covariances=prior.covariances + kept**2 * (self.covariances - prior.covariances),
             evidence=prior.evidence + kept * (self.evidence - prior.evidence),
         )
+
+    def after_use(self, seconds: float, forgetting: float) -> "LearnedLayer":
+        """After so many seconds of use, where an hour gives back a part of the variance that contacts have taken away.
+
+        The prediction step between the presses that the layer learns from: after t hours the covariance P of the modes
+        is ``I + (1 - forgetting)^t (P - I)``, and their mean m is ``(1 - forgetting)^(t / 2) m``.
+
+        Args:
+            forgetting: that part, from 0 to less than 1.
+
+        Raises:
+            InverseError: if a number is out of range.
+        """
+        if not 0 <= seconds < np.inf:
+            raise InverseError(f"seconds is {seconds}; give a time of use, zero or more")
+        if not 0 <= forgetting < 1:
+            raise InverseError(f"forgetting is {forgetting}; give 0 to less than 1")
+        return self.aged(1 - (1 - forgetting) ** (seconds / (2 * HOUR)))
 
     def restarted(self) -> "LearnedLayer":
         """Without the gain, where it cannot be believed; how far presses differ stays known."""
