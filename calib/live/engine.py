@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array
 
 import jaxeit as je
-from jaxeit.tracking import Track
+from jaxeit.tracking import LearnedLayer, Track
 
 from ..calibration.calibration import Calibration
 from ..calibration.force_maps import ForceModel, filled, force_model, fused, is_loaded
@@ -299,6 +299,11 @@ class Engine:
     def doubt(self) -> str:
         """What is to be said of the places of the electrodes: of the first rest, or by the calibration."""
         return self._doubt if self._follower is None else self._follower.doubt
+
+    @property
+    def layer(self) -> LearnedLayer | None:
+        """What is known of the gain of the contact layer; None: nothing, or contacts are not followed."""
+        return None if self._follower is None else self._follower.layer
 
     @property
     def faults(self) -> tuple[str, ...]:

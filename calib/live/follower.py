@@ -64,6 +64,11 @@ class LiveFollower:
         self.doubt = placement_note(self._calibration.skin, quiet.untouched, used)
         self.restart()
 
+    @property
+    def layer(self) -> LearnedLayer | None:
+        """The gain of the contact layer as contacts that have lifted told it: the same object until others have."""
+        return self._layer if self._now is None else self._now.layer
+
     def learned(self) -> LearnedLayer | None:
         """The gain of the contact layer, as the calibration knows it and contacts have told it since; None: unknown."""
         if self._tracker is None or self._now is None:

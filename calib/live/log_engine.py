@@ -48,6 +48,7 @@ class LogEngine:
 
     doubt = ""  # of places: a log has none
     faults: tuple[str, ...] = ()  # of EIT, and of pads against EIT
+    layer = None  # of contacts, which a log does not locate
 
     @property
     def health(self) -> str:

@@ -129,6 +129,7 @@ class LiveControl:
     | health    | of the calibration, in words, while it is being recalibrated or its places are doubtful  |
     | doubt     | about places of contacts, in words                                                       |
     | faults    | what cannot be true in the streams or hinders their links, in words                      |
+    | layer     | gain of the contact layer, where contacts are followed; another object once it has changed |
     | simulated | whether a device reports that its values are simulated                                   |
     | warn      | called with what the operator should know                                                |
     """
@@ -140,6 +141,7 @@ class LiveControl:
     health: str = ""
     doubt: str = ""
     faults: tuple[str, ...] = ()
+    layer: je.tracking.LearnedLayer | None = None
     simulated: bool = False
     warn: Callable[[str], object] = _ignore
 
@@ -373,6 +375,7 @@ def _tell_state(control: LiveControl, engine: Engine | LogEngine, recorder: Reco
     if engine.doubt not in ("", control.doubt):
         control.warn(engine.doubt)
     control.state, control.health, control.doubt = engine.state, engine.health, engine.doubt
+    control.layer = engine.layer
 
 
 def _tell_faults(control: LiveControl, engine: Engine | LogEngine, recorder: Recorder) -> None:

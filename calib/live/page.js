@@ -59,7 +59,10 @@ function layOut() {  // the proportions are those of the skin
   style.top = `${100 * (mm(-scene.high[1] - dy / 2) - top) / height}%`;
   style.width = `${100 * mm(dx * scene.columns) / width}%`;
   style.height = `${100 * mm(dy * scene.rows) / height}%`;
-  [$("map").width, $("map").height] = [scene.columns, scene.rows];
+  for (const id of ["map", "layer-mean", "layer-deviation"])
+    [$(id).width, $(id).height] = [scene.columns, scene.rows];
+  for (const id of ["layer-mean", "layer-deviation"])
+    $(id).style.aspectRatio = (dx * scene.columns) / (dy * scene.rows);
   new ResizeObserver(() => $("marks").style.setProperty("--unit", width / $("marks").clientWidth)).observe($("marks"));
 }
 function drawSkin() {  // what does not move
@@ -87,16 +90,19 @@ function fullColour() {
   if ($("which").value === "map") return share * scene.full_pressure;
   return share * (scene.full_change || largestChange || 1e-30);
 }
-function drawMap(result) {  // force per area, or how much the sheet's conductivity has changed
-  const force = $("which").value === "map", values = floats(result[force ? "map" : "image"]), areas = scene.cells;
-  if (!force) largestChange = values.reduce((most, value) => Math.max(most, Math.abs(value)), largestChange);
-  const full = fullColour(), image = new ImageData(scene.columns, scene.rows);
+function paint(canvas, share) {  // the colours of all cells of the sheet, by their shares of full colour
+  const image = new ImageData(scene.columns, scene.rows);
   for (let row = 0; row < scene.rows; row++) for (let column = 0; column < scene.columns; column++) {
     const cell = row * scene.columns + column, at = 4 * ((scene.rows - 1 - row) * scene.columns + column);
-    if (!areas[cell]) continue;  // outside of the sheet
-    image.data.set([...colour((force ? values[cell] / areas[cell] : Math.abs(values[cell])) / full), 255], at);
+    if (scene.cells[cell]) image.data.set([...colour(share(cell)), 255], at);
   }
-  $("map").getContext("2d").putImageData(image, 0, 0);
+  canvas.getContext("2d").putImageData(image, 0, 0);
+}
+function drawMap(result) {  // force per area, or how much the sheet's conductivity has changed
+  const force = $("which").value === "map", values = floats(result[force ? "map" : "image"]);
+  if (!force) largestChange = values.reduce((most, value) => Math.max(most, Math.abs(value)), largestChange);
+  const full = fullColour();
+  paint($("map"), cell => (force ? values[cell] / scene.cells[cell] : Math.abs(values[cell])) / full);
   tellScale(full, force);
 }
 function quantity(value, force) { return force ? `${plain(value / 1e3)} kPa` : `${value.toExponential(1)} S`; }
@@ -110,6 +116,26 @@ function tellScale(full, force) {
     `; ellipses hold a contact with 90 %` + ($("smooth").checked ? "; smoothed display" : ""));
   $("bar").setAttribute("aria-label", `colour scale from 0 to ${quantity(full, force)}`);
   $("map").className = $("smooth").checked ? "smooth" : "";
+}
+let layer = null;  // what contacts have told of the contact layer, and whether it is drawn
+function drawLayer() {  // mean and standard deviation of the logarithm of its gain
+  if (!layer || layer.drawn) return;
+  const mean = floats(layer.mean), deviation = floats(layer.deviation);
+  const { contacts, full_mean: high, full_deviation: most } = layer;
+  $("layer").hidden = false;
+  paint($("layer-mean"), cell => (mean[cell] + high) / (2 * high));
+  paint($("layer-deviation"), cell => deviation[cell] / most);
+  setText("layer-title", `log gain of the contact layer, learned from ${contacts} contact${contacts === 1 ? "" : "s"}`);
+  setText("layer-low", `≤ −${plain(high)}`);
+  setText("layer-high", `≥ ${plain(high)}`);
+  setText("layer-most", `≥ ${plain(most)}`);
+  const range = values => {
+    const there = values.filter((_, cell) => scene.cells[cell]);
+    return [Math.min, Math.max].map(end => fixed(there.reduce((a, b) => end(a, b)), 2)).join(" to ");
+  };
+  $("layer-mean").setAttribute("aria-label", `mean of the log gain of the contact layer, ${range(mean)}`);
+  $("layer-deviation").setAttribute("aria-label", `standard deviation of the log gain, ${range(deviation)}`);
+  layer.drawn = true;
 }
 function ellipseOf([[a, b], [, c]]) {  // of 90 %: its half axes (m), and the angle (rad) from x to the longer one
   const mean = (a + c) / 2, half = Math.hypot((a - c) / 2, b);
@@ -236,11 +262,19 @@ function show() {  // the newest result
   if (scene.rows) { drawMap(last); drawMarks(last); tableContacts(last); tellKinds(last); }
   tablePads(last); tellPace(last);
 }
-function refresh() { if (last) { readColours(); if (scene.rows) { drawMap(last); drawMarks(last); } drawHistories(); } }
+function refresh() {
+  if (!last) return;
+  readColours();
+  if (scene.rows) { drawMap(last); drawMarks(last); }
+  if (layer) { layer.drawn = false; drawLayer(); }
+  drawHistories();
+}
 function receive(event) {
   const news = JSON.parse(event.data);
   setText("state", [paused ? "paused" : "", news.about.state, news.about.health].filter(Boolean).join("; "));
   $("simulated").hidden = !news.about.simulated && !scene.simulated;
+  if (news.layer) layer = news.layer;
+  if (!paused) drawLayer();
   if (!news.result) return;
   if (scene.rows) keepTrails(news.result);
   keepHistories(news.result, news.about.lost || 0);

@@ -2,6 +2,16 @@
 
 A viewer gets the newest result whenever it is ready, so that a slow viewer sees fewer results, never older ones. By
 default the server listens on this machine only. The page loads nothing from other servers.
+
+Each message is one object of JSON:
+
+| key    | meaning                                                                                             |
+|--------|-----------------------------------------------------------------------------------------------------|
+| about  | state, health, simulated and lost of `LiveControl`, the state with the faults                       |
+| result | the newest result with map and image (`FrameResult.to_json`, `LogResult.to_json`); null: no new one |
+| layer  | what contacts have told of the gain of the contact layer, if it has changed (`layer_maps`); null    |
+|        | otherwise: mean and standard deviation of its logarithm in each pixel, as base64 of little-endian   |
+|        | f4; the values of full colour; and the number of contacts that told them                            |
 """
 
 import contextlib
@@ -12,11 +22,15 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from jaxeit.tracking import LearnedLayer
+
 from ..calibration.calibration import Calibration
 from ..calibration.logs.calibration import LogCalibration
 from ..record.broadcast import address_family, host_and_port
 from .loop import LiveControl
-from .page_scene import page_scene
+from .page_scene import layer_maps, page_scene
 from .results import Result
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -60,6 +74,11 @@ class Page(ThreadingHTTPServer):
     ):
         self.control, self.scene = control, json.dumps(page_scene(calibration)).encode()
         self._result: Result | None = None
+        self._centres = np.zeros((0, 2))
+        if not isinstance(calibration, LogCalibration):
+            self._centres = np.asarray(calibration.recon.centres, float)
+        self._drawing = threading.Lock()
+        self._drawn: tuple[LearnedLayer | None, str] = None, "null"
         self._fresh = threading.Condition()
         self._host = host
         self._free, self._told = (threading.BoundedSemaphore(MAX_CONNECTIONS) for _ in range(2))
@@ -96,6 +115,13 @@ class Page(ThreadingHTTPServer):
         with self._fresh:
             self._fresh.wait_for(lambda: self._number > after or self.control.stop.is_set(), KEEP_ALIVE_INTERVAL)
             return self._result if self._number > after else None
+
+    def layer_text(self, layer: LearnedLayer) -> str:
+        """The maps of a layer as JSON, computed once for all viewers, in the thread of the first: without JAX."""
+        with self._drawing:
+            if self._drawn[0] is not layer:
+                self._drawn = layer, json.dumps(layer_maps(layer, self._centres))
+            return self._drawn[1]
 
     @property
     def _number(self) -> int:
@@ -187,7 +213,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", "text/event-stream")
         self._end_headers()
-        number, stop = 0, self.server.control.stop
+        number, known, stop = 0, None, self.server.control.stop
         while not stop.is_set():
             result = self.server.newest(number)
             control = self.server.control
@@ -201,7 +227,10 @@ class _Handler(BaseHTTPRequestHandler):
             )
             text = result.to_json(image=True) if result is not None else "null"
             number = number if result is None else result.number
-            self.wfile.write(f'data: {{"about": {about}, "result": {text}}}\n\n'.encode())
+            layer, told = control.layer, "null"
+            if layer is not known and layer is not None and layer.contacts:
+                known, told = layer, self.server.layer_text(layer)
+            self.wfile.write(f'data: {{"about": {about}, "layer": {told}, "result": {text}}}\n\n'.encode())
             self.wfile.flush()
             stop.wait(MIN_RESULT_INTERVAL)
 

@@ -1,4 +1,7 @@
-"""What the live page is told once: outlines, electrodes, the grid of the map, and the fixed scales of colour."""
+"""What the live page is told once: outlines, electrodes, the grid of the map, and the fixed scales of colour.
+
+What was learned of the contact layer it is told whenever that has changed.
+"""
 
 import base64
 from dataclasses import replace
@@ -6,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 import jaxeit as je
+from jaxeit.tracking import LearnedLayer
 
 from ..calibration.calibration import Calibration
 from ..calibration.force_maps import force_map
@@ -32,7 +36,7 @@ def page_scene(calibration: Calibration | LogCalibration) -> dict[str, object]:
         "columns": recon.shape[1],
         "low": centres.min(0).tolist(),
         "high": centres.max(0).tolist(),
-        "areas": base64.b64encode(np.asarray(recon.areas).astype("<f4").tobytes()).decode(),
+        "areas": _base64(np.asarray(recon.areas)),
         "bounds": [list(map(float, corner)) for corner in skin.domain.bounds],
         "rim": _rounded(skin.domain.boundary_point(rim)),
         "pads": [pad.name for pad in skin.pads],
@@ -45,6 +49,27 @@ def page_scene(calibration: Calibration | LogCalibration) -> dict[str, object]:
         "full_change": change,
         "radius": INSIDE_90,
     }
+
+
+def layer_maps(layer: LearnedLayer, centres: np.ndarray) -> dict[str, object]:
+    """What was learned of the contact layer, at the centres of the pixels (pixels, 2) m.
+
+    The values of full colour do not depend on what was learned: the means reach to two standard deviations of the gain
+    before any contact, in both directions, and their standard deviations to one.
+    """
+    mean, deviation = layer.at(centres)
+    unknown = float(np.hypot(layer.field.level, layer.field.deviation))
+    return {
+        "contacts": layer.contacts,
+        "mean": _base64(mean),
+        "deviation": _base64(deviation),
+        "full_mean": rounded_up(2 * unknown),
+        "full_deviation": rounded_up(unknown),
+    }
+
+
+def _base64(values: np.ndarray) -> str:
+    return base64.b64encode(values.astype("<f4").tobytes()).decode()
 
 
 def _rounded(points: np.ndarray) -> list[list[float]]:

@@ -270,11 +270,13 @@ def test_calibrate_learns_from_all_its_sessions(tracker, bundled, tmp_path, monk
 def test_live_goes_on_with_the_layer_and_writes_it(calibration, tracker, layer, tmp_path):
     known = replace(calibration, layer=layer)
     follower = LiveFollower(known, lambda *_: tracker)
-    assert follower.learned() is layer
+    assert follower.learned() is follower.layer is layer
     follower._tracker = tracker
     follower.step(np.zeros(calibration.recon.readings), np.zeros(4), np.ones(4), 10**9)
     assert tracker.started[-1] is layer
+    assert follower.layer is layer  # before the contacts of now
     follower.restart()
+    assert follower.layer.contacts == layer.contacts + CONTACTS
     assert follower.learned().contacts == layer.contacts + CONTACTS  # a new zero forgets contacts, and not the layer
     LiveRecalibrator(known, tmp_path / "live.h5", layer=follower.learned).save()
     assert calib.load_calibration(tmp_path / "live.h5").layer.contacts == layer.contacts + CONTACTS

@@ -47,7 +47,7 @@ from calib.record.recorder import Recorder, StopRequest, record_session
 from calib.record.wire import encoding
 from calib.record.wire.messages import Frame
 from jaxeit import effects as fx
-from jaxeit.tracking import Track, Tracker, Tracking
+from jaxeit.tracking import LearnedLayer, Track, Tracker, Tracking
 from tests.helpers import stand_in
 
 S = 1_000_000_000
@@ -406,6 +406,17 @@ def following(calibration, monkeypatch):
     assert engine.state == "running"
     assert compiled == made
     return engine, made[0]
+
+
+def test_viewers_are_shown_the_layer_of_contacts_that_are_followed(following, calibration):
+    layer, show, streams = stand_in(LearnedLayer, contacts=3), LiveControl(), stand_in(Recorder, receivers=())
+    _tell_state(show, following[0], streams)
+    assert show.layer is None  # nothing is known
+    following[0]._follower._layer = layer
+    _tell_state(show, following[0], streams)
+    assert show.layer is layer
+    _tell_state(show, rested(calibration), streams)
+    assert show.layer is None  # contacts are not followed
 
 
 def test_doubts_about_the_electrodes_are_told(following, calibration):

@@ -1,5 +1,7 @@
 """The live page: its structure, and what it shows and how it is used in a headless browser, where one is installed."""
 
+import base64
+import http.client
 import json
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -16,8 +18,10 @@ from calib.calibration.logs.calibration import LogCalibration
 from calib.calibration.press_examples import PressExamples
 from calib.live.loop import LiveControl
 from calib.live.page import Page, whole_page
-from calib.live.page_scene import full_scales, page_scene, rounded_up
+from calib.live.page_scene import full_scales, layer_maps, page_scene, rounded_up
 from calib.live.results import FrameResult, KindEstimate, LogResult, TouchEstimates
+from jaxeit.contacts import LoadSettings
+from jaxeit.tracking import GainField, LearnedLayer
 from tests.browser import Browser, browser_path
 from tests.helpers import stand_in
 
@@ -80,6 +84,16 @@ def result(number, position=(0.1, 0.05), *, covariance=None, level=0.0, force=FO
         dropped=0,
         touches=touches,
     )
+
+
+def some_layer(calibration, contacts=5, level=0.0):
+    """A layer whose mean log gain has another level, and whose level is known exactly."""
+    low, high = map(np.asarray, calibration.skin.domain.bounds)
+    loads = LoadSettings(gain=0.4, gain_length=0.05)
+    field = GainField.on_sheet(np.stack([low, high]), calibration.recon.centres, loads, level=0.3)
+    mean, covariance = np.zeros(len(field.places)), np.eye(len(field.places))
+    mean[0], covariance[0, 0] = level / field.level, 0.0
+    return LearnedLayer.normal(field, mean, covariance, contacts)
 
 
 # --- without a browser ---------------------------------------------------------------------------
@@ -159,6 +173,53 @@ def test_ellipses_hold_nine_contacts_in_ten():
     assert np.einsum("ni,ij,nj->n", rim, np.linalg.inv(covariance), rim) == pytest.approx(INSIDE_90**2)
 
 
+def numbers(text):
+    return np.frombuffer(base64.b64decode(text), "<f4")
+
+
+def test_maps_of_a_layer_have_scales_that_do_not_depend_on_what_was_learned(calibration):
+    layer, centres = some_layer(calibration, level=0.25), calibration.recon.centres
+    told = json.loads(json.dumps(layer_maps(layer, centres)))
+    mean, deviation = layer.at(centres)
+    np.testing.assert_allclose(numbers(told["mean"]), mean, rtol=1e-6)
+    np.testing.assert_allclose(numbers(told["deviation"]), deviation, rtol=1e-6)
+    assert mean == pytest.approx(0.25)
+    assert told["contacts"] == 5
+    assert (told["full_mean"], told["full_deviation"]) == (1.0, 0.5)  # twice 0.5, and 0.5: before any contact
+    other = layer_maps(some_layer(calibration, level=-0.7), centres)
+    assert (other["full_mean"], other["full_deviation"]) == (1.0, 0.5)
+
+
+def messages(page, count):
+    """The first messages to a new viewer."""
+    link = http.client.HTTPConnection(*page.server_address[:2], timeout=5)
+    link.request("GET", "/results")
+    lines = iter(link.getresponse().readline, b"")
+    told = (json.loads(line[6:]) for line in lines if line.startswith(b"data: "))
+    for _ in range(count):
+        yield next(told)
+    link.close()
+
+
+def test_a_viewer_is_told_the_layer_once_and_again_when_contacts_have_taught_it(page, calibration, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        "calib.live.page.layer_maps", lambda layer, _: drawn.append(layer) or {"contacts": layer.contacts}
+    )
+    monkeypatch.setattr("calib.live.page.KEEP_ALIVE_INTERVAL", 0.1)
+    told = messages(page, 8)
+    page.control.layer = some_layer(calibration, contacts=0)  # nothing was learned
+    assert next(told)["layer"] is None
+    page.control.layer = first = some_layer(calibration)
+    news = [next(told)["layer"] for _ in range(3)]
+    assert [one for one in news if one] == [{"contacts": 5}]
+    assert next(messages(page, 1))["layer"] == {"contacts": 5}  # another viewer, for whom nothing is computed anew
+    assert drawn == [first]
+    page.control.layer = some_layer(calibration, contacts=6)
+    assert {"contacts": 6} in [next(told)["layer"] for _ in range(3)]
+    assert [one.contacts for one in drawn] == [5, 6]
+
+
 # --- in a browser --------------------------------------------------------------------------------
 
 
@@ -196,10 +257,10 @@ def shown(tab, page, frame):
     tab.wait_for(f"stored === {frame.host / 1e9} || (last && last.number === {frame.number})")
 
 
-def pixel(tab, row, column):
-    """Red, green and blue of a pixel of the map, the lowest row first."""
+def pixel(tab, row, column, of="map"):
+    """Red, green and blue of a pixel of a map, the lowest row first."""
     at = f"{column}, {ROWS - 1 - row}, 1, 1"
-    return np.array(tab.value(f"Array.from($('map').getContext('2d').getImageData({at}).data)")[:3])
+    return np.array(tab.value(f"Array.from($('{of}').getContext('2d').getImageData({at}).data)")[:3])
 
 
 def box(tab, of):
@@ -208,7 +269,8 @@ def box(tab, of):
 
 @needs_browser
 @pytest.mark.parametrize(("width", "dark"), SCREENS)
-def test_nothing_is_cut_off_in_light_and_dark_and_on_a_telephone(browser, page, width, dark):
+def test_nothing_is_cut_off_in_light_and_dark_and_on_a_telephone(browser, page, calibration, width, dark):
+    page.control.layer = some_layer(calibration, contacts=1234)
     with browser.open(page.url, width, dark=dark) as tab:
         for number in range(1, 4):
             shown(tab, page, result(number, level=0.1, covariance=0.1**number * np.eye(2)))  # the first m wide
@@ -356,6 +418,45 @@ def test_what_touches_the_skin_is_told_with_probabilities(tab, page):
     assert "unlike" in tab.value("$('kinds').textContent")
     shown(tab, page, result(4))
     assert tab.value("$('kinds').hidden")
+
+
+@needs_browser
+def test_the_contact_layer_is_drawn_as_two_maps_when_contacts_have_taught_it(tab, page, calibration):
+    """Its mean is in the middle of the colours at zero, and at their end at the value that is written there."""
+    assert tab.value("$('layer').hidden")
+    colours = []
+    for contacts, level in enumerate((-1.0, 0.0, 1.0), 1):
+        page.control.layer = some_layer(calibration, contacts, level)
+        tab.wait_for(f"layer && layer.drawn && layer.contacts === {contacts}", seconds=5)
+        colours.append(pixel(tab, 2, 3, "layer-mean"))
+    low, middle, high = colours
+    assert np.abs(high - low).max() > 150
+    assert middle == pytest.approx((low + high) / 2, abs=2)
+    assert low == pytest.approx(tab.value("ink.low"))
+    share = page.control.layer.at(calibration.recon.centres)[1].reshape(ROWS, COLUMNS) / 0.5
+    for row, column in ((0, 0), (2, 3)):
+        expected = low + share[row, column] * (high - low)
+        assert pixel(tab, row, column, "layer-deviation") == pytest.approx(expected, abs=2)
+    assert tab.value("$('layer-title').textContent") == "log gain of the contact layer, learned from 3 contacts"
+    ends = tab.value("[...document.querySelectorAll('#layer .bar span')].map(span => span.textContent)")
+    assert ends == ["≤ −1", "0", "≥ 1", "0", "≥ 0.5"]
+    images = [part["name"] for part in tab.accessible() if part["role"] in ("image", "img")]
+    assert "mean of the log gain of the contact layer, 1.00 to 1.00" in images
+    shape = box(tab, "$('layer-mean')")[2:]
+    assert shape[0] / shape[1] == pytest.approx(WIDTH / HEIGHT, rel=0.03)
+
+
+@needs_browser
+def test_a_page_that_is_paused_draws_the_layer_later(tab, page, calibration):
+    tab.press(" ", "Space", " ")
+    page.control.layer = some_layer(calibration)
+    tab.wait_for("layer !== null")
+    assert tab.value("$('layer').hidden")
+    tab.press(" ", "Space", " ")
+    tab.wait_for("!$('layer').hidden")
+    drawn = tab.value("$('layer-mean').toDataURL()")
+    tab.value("document.documentElement.style.setProperty('--low', '0 0 0'), refresh()")  # as dark colours would
+    assert tab.value("$('layer-mean').toDataURL()") != drawn
 
 
 @needs_browser
