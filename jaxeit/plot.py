@@ -34,7 +34,7 @@ from .contacts import Contacts
 from .model import Model, jacobian
 from .model.bases import AbstractPictured, Picture
 from .model.forward_model import coefficients, fields
-from .skin import BoundaryPatch, Skin
+from .skin import Skin
 
 try:  # an extra: without it the rest of jaxeit works
     from matplotlib import pyplot
@@ -78,10 +78,9 @@ def show_skin(skin: Skin, axes: Axes | None = None, *, numbers: bool = True) -> 
         axes.text(x, y, f" {pad.name}", ha="left", va="bottom", color=BLUE, fontsize=8)
     middle, size = np.mean(domain.bounds, 0), np.ptp(domain.bounds, 0).max()
     for number, electrode in enumerate(skin.electrodes):
-        place = electrode.centre(domain)
-        if isinstance(electrode, BoundaryPatch):
-            arc = domain.boundary_point(np.linspace(electrode.start, electrode.stop, 33))
-            axes.plot(*_mm(arc), color=ORANGE, linewidth=4, solid_capstyle="butt")
+        place, edge = electrode.centre(domain), electrode.drawing(domain).edge
+        if edge is not None:
+            axes.plot(*_mm(edge), color=ORANGE, linewidth=4, solid_capstyle="butt")
         else:
             axes.plot(*_mm(place), "o", color=ORANGE, markersize=4)
         if numbers:  # outside at the rim, else above and to the right

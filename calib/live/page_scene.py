@@ -42,9 +42,7 @@ def page_scene(calibration: Calibration | LogCalibration) -> dict[str, object]:
         "pads": [pad.name for pad in skin.pads],
         "outlines": [_rounded(pad.outline) for pad in skin.pads],
         "electrodes": _rounded(np.asarray(skin.electrode_positions)[:, :2]),
-        "electrode_outlines": [
-            _rounded(e.outline.corner_points) for e in skin.electrodes if isinstance(e, je.PolygonPatch)
-        ],
+        "electrode_outlines": electrode_outlines(skin),
         "full_pressure": pressure,
         "full_change": change,
         "radius": INSIDE_90,
@@ -70,6 +68,12 @@ def layer_maps(layer: LearnedLayer, centres: np.ndarray) -> dict[str, object]:
 
 def _base64(values: np.ndarray) -> str:
     return base64.b64encode(values.astype("<f4").tobytes()).decode()
+
+
+def electrode_outlines(skin: je.Skin) -> list[list[list[float]]]:
+    """The outlines that are drawn to scale: of a ring two, of an electrode that is drawn as a mark none."""
+    drawings = (electrode.drawing(skin.domain) for electrode in skin.electrodes)
+    return [_rounded(outline) for drawing in drawings for outline in drawing.outlines]
 
 
 def _rounded(points: np.ndarray) -> list[list[float]]:

@@ -18,12 +18,12 @@ from calib.calibration.logs.calibration import LogCalibration
 from calib.calibration.press_examples import PressExamples
 from calib.live.loop import LiveControl
 from calib.live.page import Page, whole_page
-from calib.live.page_scene import full_scales, layer_maps, page_scene, rounded_up
+from calib.live.page_scene import electrode_outlines, full_scales, layer_maps, page_scene, rounded_up
 from calib.live.results import FrameResult, KindEstimate, LogResult, TouchEstimates
 from jaxeit.contacts import LoadSettings
 from jaxeit.tracking import GainField, LearnedLayer
 from tests.browser import Browser, browser_path
-from tests.helpers import stand_in
+from tests.helpers import skin_of, stand_in
 
 WIDTH, HEIGHT = 0.3, 0.2  # m
 ROWS, COLUMNS = 4, 6
@@ -143,6 +143,13 @@ def test_the_scene_has_the_proportions_of_the_skin(calibration):
     assert scene["electrodes"][4] == pytest.approx([0.15, 0.1])
     assert np.ptp(scene["rim"], axis=0) == pytest.approx([WIDTH, HEIGHT])
     assert scene["full_pressure"] == 4000.0  # 12 N on a tenth of a pad of 150 by 200 mm
+
+
+def test_the_page_draws_the_outlines_that_electrodes_give():
+    ring, pad = je.skin.RingPatch((0.05, 0.05), 0.004, 0.008), je.PolygonPatch(je.Polygon([(0, 0), (0.1, 0), (0, 0.1)]))
+    bolt = je.AreaPatch((0.1, 0.1), 0.003)  # a mark
+    outlines = electrode_outlines(skin_of(je.Rectangle(0.2, 0.2), (ring, pad, bolt), [[0, 1, 0, 1]]))
+    assert [np.ptp(outline, axis=0).max() for outline in outlines] == pytest.approx([0.016, 0.008, 0.1], rel=2e-3)
 
 
 def test_full_colours_are_those_of_presses_of_the_calibration(skin, monkeypatch):

@@ -31,6 +31,7 @@ from calib.report.figures.parts import ReportError, png
 from calib.report.figures.presses import localisation_figure, sensitivity_figure
 from jaxeit.contacts.loads.settings import LoadSettings
 from jaxeit.tracking import ContactLaw, GainField, LearnedLayer
+from tests.helpers import skin_of
 
 HOSTILE = "\u65e5 $x^$ <script>alert(1)</script> & 'pad' \"\x00"  # the start is what fits into a figure
 SLOPE = 0.01  # N/Pa
@@ -449,6 +450,18 @@ def test_without_matplotlib_the_error_says_what_to_install(calibration, skin, tm
     with pytest.raises(ReportError, match=r"jaxeit\[report\]"):
         write_report(calibration, tmp_path / "page.html")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_electrodes_are_drawn_to_scale_where_they_give_outlines():
+    """A ring by both of its circles, a polygon by its corners, and a bolt, which is small, as a mark."""
+    ring, bolt = je.skin.RingPatch((0.05, 0.05), 0.004, 0.008), je.AreaPatch((0.1, 0.1), 0.003)
+    pad = je.PolygonPatch(je.Polygon([(0.1, 0.02), (0.12, 0.02), (0.11, 0.03)]))
+    axes = parts.bare_figure(4, 4).subplots()
+    parts.draw_electrodes(axes, skin_of(je.Rectangle(0.2, 0.2), (ring, bolt, pad), [[0, 1, 0, 1]]))
+    sizes = [np.ptp(path.vertices, axis=0).max() for path in axes.collections[0].get_paths()]
+    assert sizes == pytest.approx([16, 8, 20], rel=2e-3)  # mm
+    (marks,) = axes.lines
+    np.testing.assert_allclose(marks.get_xydata(), [[100, 100]])
 
 
 def test_unknown_estimator_is_refused_by_name(calibration, skin):

@@ -159,6 +159,14 @@ def test_a_skin_file_with_rings_is_simulated():
     assert float(jnp.abs(pressed - before).max()) > 0
 
 
+def test_pictures_show_a_ring_with_its_hole():
+    outer, hole = je.skin.RingPatch((0.05, 0.06), 0.003, 0.006).drawing(SQUARE).outlines
+    for outline, radius in ((outer, 0.006), (hole, 0.003)):
+        assert np.ptp(outline, axis=0) == pytest.approx(2 * radius, rel=2e-3)
+        assert outline.mean(0) == pytest.approx([0.05, 0.06])
+    assert je.AreaPatch((0.05, 0.06), 0.003).drawing(SQUARE) == je.skin.Drawing()  # a mark at its centre
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

@@ -109,10 +109,10 @@ def draw_sheet(axes: Any, skin: je.Skin) -> None:
 
 
 def draw_electrodes(axes: Any, skin: je.Skin) -> None:
-    """Draw polygons to scale, all other electrodes as circles of one size, because most are too small to see."""
-    shapes = [e.outline.corner_points * MM for e in skin.electrodes if isinstance(e, je.PolygonPatch)]
-    round_ones = [not isinstance(e, je.PolygonPatch) for e in skin.electrodes]
-    place = skin.electrode_positions[round_ones] * MM
+    """Draw electrodes that give outlines to scale, all others as circles of one size, because most are too small."""
+    drawings = [electrode.drawing(skin.domain) for electrode in skin.electrodes]
+    shapes = [outline * MM for drawing in drawings for outline in drawing.outlines]
+    place = skin.electrode_positions[[not drawing.outlines for drawing in drawings]] * MM
     if len(place):
         axes.plot(*place.T, "o", ms=9, mfc="none", mec=GREEN, mew=1.6, label="electrode", zorder=2)
     label = None if len(place) else "electrode"

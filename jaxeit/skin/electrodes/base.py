@@ -1,9 +1,10 @@
 """Electrode models: the contact between a terminal of the instrument and the sheet.
 
 Every model states the outline that the mesh must follow (`footprint`), the pieces of the mesh that it touches
-(`pieces`), and its form in a skin file (`read`).  A complete electrode has a contact conductance
-``g`` per unit of its measure (area for a bolt, length for an edge electrode) and obeys, with u the
-sheet potential and U its own,
+(`pieces`), its form in a skin file (`read`), and what pictures show of it (`drawing`).
+
+A complete electrode has a contact conductance ``g`` per unit of its measure (area for a bolt, length for an edge
+electrode) and obeys, with u the sheet potential and U its own,
 
     -div(sigma grad u) + sum_l chi_l g_l (u - U_l) = 0,      integral over E_l of g_l (U_l - u) = I_l
 
@@ -44,6 +45,19 @@ class Pieces:
     mass: np.ndarray
 
 
+class Drawing(NamedTuple):
+    """What pictures show of an electrode, in the sheet's flat coordinates; without either, a mark at its centre.
+
+    | meaning                                                            | shape        | unit |
+    |--------------------------------------------------------------------|--------------|------|
+    | outlines: closed polygons to scale, the rim and then each hole     | (corners, 2) | m    |
+    | edge: the stretch of the sheet's edge that the electrode covers    | (points, 2)  | m    |
+    """
+
+    outlines: tuple[np.ndarray, ...] = ()
+    edge: np.ndarray | None = None
+
+
 class AbstractElectrode(ABC):
     """One terminal.  ``contact`` is its specific contact resistance; 0 means a perfect contact.
 
@@ -77,6 +91,10 @@ class AbstractElectrode(ABC):
     @abstractmethod
     def centre(self, domain: Domain) -> np.ndarray:
         """Middle of the electrode in the sheet's flat coordinates, (2,) m."""
+
+    def drawing(self, domain: Domain) -> Drawing:
+        """What pictures show: a mark at the centre, unless the class gives outlines or a stretch of the edge."""
+        return Drawing()
 
     @classmethod
     @abstractmethod

@@ -14,12 +14,15 @@ from ...meshing.triangles import MeshError, place
 from ...toml import TomlTable
 from .base import (
     AbstractAreaElectrode,
+    Drawing,
     ElectrodeError,
     require_contact,
     require_covered,
     require_positive,
 )
 from .places import read_area_contact, read_positions_inside, read_radius
+
+DRAWN_SIDES = 64  # of each circle in pictures
 
 
 @dataclass(frozen=True)
@@ -150,6 +153,10 @@ class RingPatch(AbstractAreaElectrode):
 
     def centre(self, domain: Domain) -> np.ndarray:
         return np.asarray(self.position, float)
+
+    def drawing(self, domain: Domain) -> Drawing:
+        radii = self.outer_radius, self.inner_radius
+        return Drawing(tuple(DiscFootprint(self.position, radius, DRAWN_SIDES).rim for radius in radii))
 
     @classmethod
     def read(cls, table: TomlTable, domain: Domain) -> tuple["RingPatch", ...]:
