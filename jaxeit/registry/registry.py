@@ -1,9 +1,10 @@
 """Classes of one kind by the names that files and the command line use.
 
 A registry does not list its classes: it collects them from the package that defines them, so that a new class is known
-as soon as its module is imported.  Other packages add classes by entry points, and users name a class of their own by
-its import path, ``my_package.my_module:MyEffect``.  One reader serves TOML tables (``type = "Creep"`` and its settings)
-and words of the command line (``greit:width=0.01,radius=0.02``).
+as soon as its module is imported, or named in the stub of a room whose names are imported on first use.  Other packages
+add classes by entry points, and users name a class of their own by its import path, ``my_package.my_module:MyEffect``.
+One reader serves TOML tables (``type = "Creep"`` and its settings) and words of the command
+line (``greit:width=0.01,radius=0.02``).
 """
 
 import functools
@@ -76,6 +77,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
     @property
     def shipped(self) -> dict[str, type[T]]:
         """The classes of the package by name, in the order in which they are defined."""
+        _import_on_demand(self._room[:-1])
         modules = [module for name, module in list(sys.modules.items()) if name.startswith(self._room)]
         classes = [(thing, module) for module in modules for thing in vars(module).values() if isclass(thing)]
         own = [cast(type[T], kind) for kind, module in classes if kind.__module__ == module.__name__]
@@ -278,6 +280,18 @@ def _made(kind: type[T], table: TomlTable, given: Mapping[str, Any], parts: tupl
         return kind(**values, **given)
     except (ValueError, TypeError) as error:
         raise table.error(kind.__name__, _one_line(error).removeprefix(f"{kind.__name__}: ")) from None
+
+
+@functools.cache
+def _import_on_demand(room: str) -> None:
+    """Import the modules of a room whose names are imported on first use, so that their classes are found.
+
+    The package at the top is left out: it has names of all rooms, and each room has registries of its own.
+    """
+    package = sys.modules.get(room) if "." in room else None
+    if package is not None and hasattr(package, "__getattr__"):
+        for name in package.__all__:
+            getattr(package, name)
 
 
 @functools.cache
