@@ -26,7 +26,14 @@ from .description import (
     parse_skin,
     shipped_skins,
 )
-from .electrodes.base import ELECTRODES, AbstractAreaElectrode, AbstractElectrode, Drawing, ElectrodeError, Pieces
+from .electrodes.base import (
+    ELECTRODES,
+    AbstractAreaElectrode,
+    AbstractElectrode,
+    ElectrodeDrawing,
+    ElectrodeError,
+    Pieces,
+)
 from .electrodes.bolts import AreaPatch
 from .electrodes.edges import BoundaryPatch
 from .electrodes.points import PointElectrode
@@ -44,7 +51,7 @@ __all__ = [
     "AbstractElectrode",
     "AreaPatch",
     "BoundaryPatch",
-    "Drawing",
+    "ElectrodeDrawing",
     "ElectrodeError",
     "Pad",
     "Pieces",

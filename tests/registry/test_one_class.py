@@ -42,7 +42,9 @@ class Wetness(AbstractSheetEffect):
     "prior": '''"""R = I."""
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
+from ..model.bases import Picture
 from .priors import AbstractPrecision, AbstractPrior, Diagonal
 
 
@@ -51,7 +53,9 @@ class Flat(AbstractPrior):
 
     scale: float = 1.0
 
-    def precision(self, jacobian, picture, at=None) -> AbstractPrecision:
+    def precision(
+        self, jacobian: Float[Array, "k basis"], picture: Picture, at: Float[Array, " basis"] | None = None
+    ) -> AbstractPrecision:
         return Diagonal(jnp.full(jacobian.shape[1], self.scale, jacobian.dtype))
 ''',
     "method": '''"""x = J^T y."""
@@ -109,7 +113,7 @@ import numpy as np
 
 from ...geometry.shapes import Polygon
 from ...meshing.outlines import PolygonFootprint
-from .base import AbstractAreaElectrode, Drawing
+from .base import AbstractAreaElectrode, ElectrodeDrawing
 from .places import read_area_contact, read_positions_inside
 
 
@@ -138,8 +142,8 @@ class CrossPatch(AbstractAreaElectrode):
     def centre(self, domain) -> np.ndarray:
         return np.asarray(self.position, float)
 
-    def drawing(self, domain) -> Drawing:
-        return Drawing((self.shape.corner_points,))
+    def drawing(self, domain) -> ElectrodeDrawing:
+        return ElectrodeDrawing((self.shape.corner_points,))
 
     @classmethod
     def read(cls, table, domain) -> tuple["CrossPatch", ...]:

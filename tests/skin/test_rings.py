@@ -164,7 +164,7 @@ def test_pictures_show_a_ring_with_its_hole():
     for outline, radius in ((outer, 0.006), (hole, 0.003)):
         assert np.ptp(outline, axis=0) == pytest.approx(2 * radius, rel=2e-3)
         assert outline.mean(0) == pytest.approx([0.05, 0.06])
-    assert je.AreaPatch((0.05, 0.06), 0.003).drawing(SQUARE) == je.skin.Drawing()  # a mark at its centre
+    assert je.AreaPatch((0.05, 0.06), 0.003).drawing(SQUARE) == je.skin.ElectrodeDrawing()  # a mark at its centre
 
 
 @pytest.mark.parametrize(

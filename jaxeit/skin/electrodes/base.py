@@ -45,7 +45,7 @@ class Pieces:
     mass: np.ndarray
 
 
-class Drawing(NamedTuple):
+class ElectrodeDrawing(NamedTuple):
     """What pictures show of an electrode, in the sheet's flat coordinates; without either, a mark at its centre.
 
     | meaning                                                            | shape        | unit |
@@ -92,9 +92,9 @@ class AbstractElectrode(ABC):
     def centre(self, domain: Domain) -> np.ndarray:
         """Middle of the electrode in the sheet's flat coordinates, (2,) m."""
 
-    def drawing(self, domain: Domain) -> Drawing:
+    def drawing(self, domain: Domain) -> ElectrodeDrawing:
         """What pictures show: a mark at the centre, unless the class gives outlines or a stretch of the edge."""
-        return Drawing()
+        return ElectrodeDrawing()
 
     @classmethod
     @abstractmethod

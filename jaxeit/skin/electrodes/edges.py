@@ -10,7 +10,7 @@ from ...geometry.shapes import Domain
 from ...meshing.elements import Space
 from ...meshing.outlines import ArcFootprint
 from ...toml import TomlError, TomlTable
-from .base import AbstractElectrode, Drawing, ElectrodeError, Pieces, require_contact, require_positive
+from .base import AbstractElectrode, ElectrodeDrawing, ElectrodeError, Pieces, require_contact, require_positive
 from .places import read_contact
 
 DRAWN_POINTS = 33  # along an electrode in pictures
@@ -54,8 +54,8 @@ class BoundaryPatch(AbstractElectrode):
     def centre(self, domain: Domain) -> np.ndarray:
         return np.asarray(domain.boundary_point(0.5 * (self.start + self.stop)))
 
-    def drawing(self, domain: Domain) -> Drawing:
-        return Drawing(edge=domain.boundary_point(np.linspace(self.start, self.stop, DRAWN_POINTS)))
+    def drawing(self, domain: Domain) -> ElectrodeDrawing:
+        return ElectrodeDrawing(edge=domain.boundary_point(np.linspace(self.start, self.stop, DRAWN_POINTS)))
 
     @classmethod
     def read(cls, table: TomlTable, domain: Domain) -> tuple["BoundaryPatch", ...]:

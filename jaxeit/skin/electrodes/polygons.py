@@ -11,7 +11,7 @@ from ...meshing.elements import Space
 from ...meshing.outlines import PolygonFootprint
 from ...meshing.smoothing import doubled_areas
 from ...toml import TomlTable
-from .base import AbstractAreaElectrode, Drawing, ElectrodeError, require_contact
+from .base import AbstractAreaElectrode, ElectrodeDrawing, ElectrodeError, require_contact
 from .places import read_area_contact, read_positions
 
 
@@ -61,8 +61,8 @@ class PolygonPatch(AbstractAreaElectrode):
     def centre(self, domain: Domain) -> np.ndarray:
         return self.outline.centroid
 
-    def drawing(self, domain: Domain) -> Drawing:
-        return Drawing((self.outline.corner_points,))
+    def drawing(self, domain: Domain) -> ElectrodeDrawing:
+        return ElectrodeDrawing((self.outline.corner_points,))
 
     @classmethod
     def read(cls, table: TomlTable, domain: Domain) -> tuple["PolygonPatch", ...]:

@@ -14,7 +14,7 @@ from ...meshing.triangles import MeshError, place
 from ...toml import TomlTable
 from .base import (
     AbstractAreaElectrode,
-    Drawing,
+    ElectrodeDrawing,
     ElectrodeError,
     require_contact,
     require_covered,
@@ -154,9 +154,9 @@ class RingPatch(AbstractAreaElectrode):
     def centre(self, domain: Domain) -> np.ndarray:
         return np.asarray(self.position, float)
 
-    def drawing(self, domain: Domain) -> Drawing:
+    def drawing(self, domain: Domain) -> ElectrodeDrawing:
         radii = self.outer_radius, self.inner_radius
-        return Drawing(tuple(DiscFootprint(self.position, radius, DRAWN_SIDES).rim for radius in radii))
+        return ElectrodeDrawing(tuple(DiscFootprint(self.position, radius, DRAWN_SIDES).rim for radius in radii))
 
     @classmethod
     def read(cls, table: TomlTable, domain: Domain) -> tuple["RingPatch", ...]:
