@@ -10,8 +10,7 @@ import jaxeit as je
 
 from ..check.acceptance import accept
 from ..check.placement import placement_note
-from ..presses.streams import finite_mean
-from ..presses.table import Level, Processing, resting_levels
+from ..presses.table import Processing, resting_levels
 from ..session import ArchiveWriter, Session
 from ..session.given import require_session
 from .calibration import Calibration
@@ -29,7 +28,8 @@ from .recalibration.agreement import agreement_of_use
 FORCE_MAP_FORMAT = "skin-forcemap"
 TRACKS = "tracks/"  # group of the arrays of contacts that were followed
 LOADS = "loads/"  # group of the arrays of loads in windows
-LEVELS = 64  # times at which the level without contact is averaged
+
+_Coordinate = tuple[np.ndarray, str, str, tuple[str, ...]]  # values, unit, meaning, names of the axes
 
 
 def apply(
@@ -83,7 +83,8 @@ def apply(
     proposed = None if loads is None else chosen_proposal(proposal, calibration.skin, tell, load_settings)
     levels = resting_levels(session, calibration.skin, processing)
     found = accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED_PARTS)
-    calibration, outside = _agreement(calibration, session, levels)
+    blocks = FrameBlocks(session, processing, levels)
+    calibration, outside = _agreement(calibration, session, blocks)
     attrs = _attributes(calibration, session) | {
         "ignored_errors": "\n".join(found.ignored),
         "warnings": "\n".join(found.warnings),
@@ -93,9 +94,12 @@ def apply(
         attrs["load_settings"] = load_settings.changed()
     for line in (*found.warnings, *outside):
         tell(f"note: {line}")
-    blocks = FrameBlocks(session, processing, levels)
+    (sizes, coordinates), kinds = _coordinates(calibration), _rows(calibration, session.epoch)
     with ArchiveWriter(path, FORCE_MAP_FORMAT, {name: value for name, value in attrs.items() if value != ""}) as writer:
-        kinds = _begin_rows(writer, calibration, session.epoch)
+        for name, about in coordinates.items():
+            writer.add(name, *about)
+        for name, (dims, units, meaning, dtype) in kinds.items():  # arrays with a row for each frame
+            writer.add_rows(name, tuple(sizes[dim] for dim in dims), units, meaning, dtype, ("time", *dims))
         also: list[_Loads | _Tracks] = []
         if loads is not None:
             fit = partial(fit_windows, calibration, progress=progress, proposal=proposed, settings=load_settings)
@@ -111,29 +115,11 @@ def apply(
     return Path(path)
 
 
-def _agreement(
-    calibration: Calibration, session: Session, levels: Mapping[str, Level]
-) -> tuple[Calibration, tuple[str, ...]]:
+def _agreement(calibration: Calibration, session: Session, blocks: FrameBlocks) -> tuple[Calibration, tuple[str, ...]]:
     """The calibration, with wider intervals where pads and image disagree; and what lies outside of it, in words."""
     calibration, outside = agreement_of_use(calibration, session)
-    doubt = placement_note(calibration.skin, _untouched(session, levels), np.asarray(calibration.recon.channels))
+    doubt = placement_note(calibration.skin, blocks.untouched(), np.asarray(calibration.recon.channels))
     return calibration, (*outside, doubt) if doubt else outside
-
-
-def _begin_rows(writer: ArchiveWriter, calibration: Calibration, epoch: str) -> Iterable[str]:
-    """Write all coordinates but time, and begin the arrays with a row for each frame; returns their names."""
-    sizes, kinds = _add_coordinates(writer, calibration), _rows(calibration, epoch)
-    for name, (dims, units, meaning, dtype) in kinds.items():
-        tail = tuple(sizes[dim] for dim in dims)
-        writer.add_rows(name, tail, units, meaning, dtype, ("time", *dims))
-    return kinds
-
-
-def _untouched(session: Session, levels: Mapping[str, Level]) -> np.ndarray:
-    """Mean frame without contact, (readings,) V."""
-    time = session.stream("eit").time
-    level = levels["eit"](np.linspace(time[0], time[-1], LEVELS))
-    return np.asarray(finite_mean(level))
 
 
 def _attributes(calibration: Calibration, session: Session) -> dict[str, str | int]:
@@ -152,9 +138,9 @@ def _attributes(calibration: Calibration, session: Session) -> dict[str, str | i
     }
 
 
-def _add_coordinates(writer: ArchiveWriter, calibration: Calibration) -> dict[str, int]:
-    """Write the coordinates of all axes but time, and where the pixels lie; returns the lengths of the axes."""
-    pads, centres = calibration.skin.pads, np.asarray(calibration.recon.centres)
+def _coordinates(calibration: Calibration) -> tuple[dict[str, int], dict[str, _Coordinate]]:
+    """Lengths of all axes but time, with their coordinates, and where the pixels lie."""
+    pads, centres, areas = calibration.skin.pads, *map(np.asarray, (calibration.recon.centres, calibration.recon.areas))
     contacts = 0 if calibration.locator is None else calibration.locator.contacts
     about = {
         "pixel": (len(centres), "number of the pixel, row by row"),
@@ -163,29 +149,31 @@ def _add_coordinates(writer: ArchiveWriter, calibration: Calibration) -> dict[st
         "space": (3, "0: x, 1: y, 2: z"),
         "contact": (contacts, "number of the contact in its frame"),
     }
-    for name, (size, meaning) in about.items():
-        if size:
-            writer.add(name, np.arange(size, dtype="i4"), "1", meaning, (name,))
-    writer.add("centres", centres, "m", "centres of the pixels", ("pixel", "axis"))
-    for name, values in zip("xy", centres.T, strict=True):
-        writer.add(name, values, "m", f"centres of the pixels along {name}", ("pixel",))
-    areas = np.asarray(calibration.recon.areas)
-    writer.add("areas", areas, "m2", "areas of the pixels", ("pixel",))
-    _add_places(writer, calibration.skin, centres, areas > 0)
-    return {name: size for name, (size, _) in about.items()}
+    sizes = {name: size for name, (size, _) in about.items()}
+    numbers = {n: (np.arange(size, dtype="i4"), "1", text, (n,)) for n, (size, text) in about.items() if size}
+    pixels = {
+        "centres": (centres, "m", "centres of the pixels", ("pixel", "axis")),
+        "x": (centres[:, 0], "m", "centres of the pixels along x", ("pixel",)),
+        "y": (centres[:, 1], "m", "centres of the pixels along y", ("pixel",)),
+        "areas": (areas, "m2", "areas of the pixels", ("pixel",)),
+    }
+    return sizes, numbers | pixels | _places(calibration.skin, centres, areas > 0)
 
 
-def _add_places(writer: ArchiveWriter, skin: je.Skin, centres: np.ndarray, covered: np.ndarray) -> None:
-    """Write where the skin lies in space, for programs that do not know its surface."""
+def _places(skin: je.Skin, centres: np.ndarray, covered: np.ndarray) -> dict[str, _Coordinate]:
+    """Where the skin lies in space, for programs that do not know its surface."""
     surface, pads = skin.surface, pad_centres(skin)
     places = points_in_space(surface, centres, covered)
-    writer.add("points", places, "m", "centres of the pixels in space; NaN: off the sheet", ("pixel", "space"))
+    meaning = "centres of the pixels in space; NaN: off the sheet"
+    out: dict[str, _Coordinate] = {"points": (places, "m", meaning, ("pixel", "space"))}
     if not len(pads):
-        return
-    writer.add("pad_names", np.array([pad.name for pad in skin.pads]), "1", "names of the pads", ("pad",))
-    writer.add("pad_points", points_in_space(surface, pads), "m", "centres of the pads in space", ("pad", "space"))
-    normals = normals_in_space(surface, pads)
-    writer.add("pad_normals", normals, "1", "normals of the sheet there, away from its inside", ("pad", "space"))
+        return out
+    meaning, normals = "normals of the sheet there, away from its inside", normals_in_space(surface, pads)
+    return out | {
+        "pad_names": (np.array([pad.name for pad in skin.pads]), "1", "names of the pads", ("pad",)),
+        "pad_points": (points_in_space(surface, pads), "m", "centres of the pads in space", ("pad", "space")),
+        "pad_normals": (normals, "1", meaning, ("pad", "space")),
+    }
 
 
 def _append(writer: ArchiveWriter, rows: Mapping[str, np.ndarray], names: Iterable[str], group: str = "") -> None:

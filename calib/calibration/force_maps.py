@@ -102,15 +102,15 @@ def force_map(
     """
     require_calibration(calibration, "force_map", "give calibration.predict(time, values)")
     je.fusion.require_gate(gate)
-    frames, pressures = _changes(calibration, frames, pressures)
     if before is not None:
         before = calibration.pad_rows(before, "before")
+    frames, pressures = _changes(calibration, frames, pressures)
     if not len(frames):  # programs are of one row at least
         row = force_map(calibration, np.zeros((1, frames.shape[1])), np.zeros((1, pressures.shape[1])), gate=gate)
         return first_rows(row, 0)
     model = force_model(calibration)
-    frames = jnp.asarray(frames, model.recon.dtype)
     pressures = jnp.asarray(pressures, model.pads.dtype)
+    frames = jnp.asarray(frames, model.recon.dtype)
     earlier = filled(model, before)
     image, places = model.recon(frames), None
     if model.locator is not None:

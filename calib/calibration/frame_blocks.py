@@ -8,7 +8,7 @@ import numpy as np
 
 from ..fitting.curves.play_operators import remembered
 from ..presses.corrections import AbstractCorrection, correct
-from ..presses.streams import resample
+from ..presses.streams import finite_mean, resample
 from ..presses.table import Processing
 from ..session import Session, SessionError, Stream
 from .calibration import Calibration
@@ -17,6 +17,7 @@ from .force_maps import ForceEstimate, first_rows, force_map, force_model, is_lo
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
 BLOCK = 512  # frames held in memory at once
+LEVELS = 64  # times at which the level without contact is averaged
 MARGIN = 0.5  # s read beyond a block on both sides, so that filters start and end outside it
 
 
@@ -44,25 +45,43 @@ class FrameBlocks:
     def __len__(self) -> int:
         return len(range(0, len(self._eit), BLOCK))
 
+    def untouched(self) -> np.ndarray:
+        """Mean frame without contact, (readings,) V."""
+        time = self._eit.time
+        return np.asarray(finite_mean(self._levels["eit"](np.linspace(time[0], time[-1], LEVELS))))
+
     def __iter__(self) -> Iterator[FrameBlock]:
         for first in range(0, len(self._eit), BLOCK):
             span = slice(first, min(first + BLOCK, len(self._eit)))
-            time, frames = _corrected(self._eit, span, self._filters["eit"])
-            around = _around(self._pressure, time)
-            pressure_time, values = _corrected(self._pressure, around, self._filters["pressure"])
+            eit = _read(self._eit, span)
+            pressure = _read(self._pressure, _around(self._pressure, eit.time[eit.kept]))
+            time, frames = eit.corrected(self._filters["eit"])
+            pressure_time, values = pressure.corrected(self._filters["pressure"])
             pressed = resample(pressure_time, values, time) - self._levels["pressure"](time)
             yield FrameBlock(time, frames, frames - self._levels["eit"](time), pressed)
 
 
-def _corrected(stream: Stream, span: slice, corrections: Sequence[AbstractCorrection]) -> tuple[np.ndarray, np.ndarray]:
-    """Times and corrected values of a block, read with a margin for the filters."""
+class _WithMargin(NamedTuple):
+    """A block of samples with a margin for the filters: times (m,) ns, values (m, channels), and the block in them."""
+
+    name: str
+    time: np.ndarray
+    values: np.ndarray
+    kept: slice
+
+    def corrected(self, corrections: Sequence[AbstractCorrection]) -> tuple[np.ndarray, np.ndarray]:
+        """Times and corrected values of the block."""
+        return self.time[self.kept], correct(corrections, self.time, self.values, self.name)[self.kept]
+
+
+def _read(stream: Stream, span: slice) -> _WithMargin:
+    """A block of samples, read with a margin for the filters."""
     time = stream.time
     margin = round(MARGIN * 1e9)
     first = int(np.searchsorted(time, time[span.start] - margin))
     last = int(np.searchsorted(time, time[span.stop - 1] + margin, side="right"))
-    values = correct(corrections, time[first:last], stream.read(first, last), stream.name)
     kept = slice(span.start - first, span.stop - first)
-    return time[span], values[kept]
+    return _WithMargin(stream.name, time[first:last], stream.read(first, last), kept)
 
 
 def _around(stream: Stream, time: np.ndarray) -> slice:

@@ -39,4 +39,5 @@ def normals_in_space(surface: AbstractSurface | None, chart: Float[np.ndarray, "
 
 def pad_centres(skin: je.Skin) -> Float[np.ndarray, "pads 2"]:
     """Centroids of the pads' outlines in the sheet's flat coordinates, m."""
-    return np.array([pad.polygon.centroid for pad in skin.pads]).reshape(-1, 2)
+    outlines = [pad.polygon for pad in skin.pads]
+    return np.array([outline.centroid for outline in outlines]).reshape(-1, 2)

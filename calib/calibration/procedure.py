@@ -10,7 +10,7 @@ import numpy as np
 
 import jaxeit as je
 
-from ..check.acceptance import Acceptance, accept
+from ..check.acceptance import accept
 from ..fitting.cross_validation.neighbourhoods import with_error_scale
 from ..fitting.fields import single_places
 from ..fitting.fields.unpressed_walls import unpressed_note
@@ -88,8 +88,10 @@ def calibrate(
     progress("reading")
     presses = pool_presses(sessions, skin, recipe.processing)
     accepted = accept(sessions, skin, ignore_errors=ignore_errors)
+    noted = accepted.notes
     require_every_pad_pressed(skin, presses.data)
-    calibration = _calibration(sessions, _found(skin, presses, recipe, progress), recipe, accepted)
+    found = _found(skin, presses, recipe, progress)
+    calibration = _calibration(sessions, found, recipe, noted, accepted.ignored)
     if recipe.learn_layer:
         progress(LEARNING)
         for session in sessions:
@@ -121,7 +123,12 @@ def _one_skin(sessions: Sequence[Session]) -> je.Skin:
 
 
 class _Found(NamedTuple):
-    """What the stages of a calibration find; the skin has its electrodes where the images found them, if `placed`."""
+    """What the stages of a calibration find; the skin has its electrodes where the images found them, if `placed`.
+
+    ``model`` is that of the response, with errors as large as those of held-out forces; ``gain`` that of each pad at
+    each press, (presses, pads), None without a correction by location; ``unpressed`` a note on pads of which a part was
+    never pressed, or "".
+    """
 
     skin: je.Skin
     placed: PlacedElectrodes | None
@@ -130,6 +137,9 @@ class _Found(NamedTuple):
     images: PressImages
     response: PadResponse
     held_out: HeldOutForces
+    model: PadModel
+    gain: np.ndarray | None
+    unpressed: str
 
 
 def _found(skin: je.Skin, presses: PooledPresses, recipe: Recipe, progress: Callable[[str], object]) -> _Found:
@@ -148,21 +158,23 @@ def _found(skin: je.Skin, presses: PooledPresses, recipe: Recipe, progress: Call
     progress("holding out")
     true_position = presses.position if presses.true_place else None
     held_out = hold_out_response(folds, response, presses.groups, images.integral, true_position)
-    return _Found(skin, placed, presses, imager, images, response, held_out)
+    model = with_error_scale(response.model, held_out.error_scale)
+    gain, unpressed = _gains(model, images), unpressed_note(model.field, images.places, presses.data.share)
+    return _Found(skin, placed, presses, imager, images, response, held_out, model, gain, unpressed)
 
 
-def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, accepted: Acceptance) -> Calibration:
-    presses, imager, response = found.presses, found.imager, found.response
-    choice, model = response.choice, with_error_scale(response.model, found.held_out.error_scale)
+def _calibration(
+    sessions: Sequence[Session], found: _Found, recipe: Recipe, noted: Sequence[str], ignored: Sequence[str]
+) -> Calibration:
+    presses, imager, response, model = found.presses, found.imager, found.response, found.model
     evaluation = _held_out_evaluation(found)
     return Calibration(
         skin=found.skin,
         recon=imager.recon,
         masks=imager.masks,
         curves=model.curves,
-        notes=(*accepted.notes, *_notes(found, evaluation)),
+        notes=(*noted, *_notes(found, evaluation)),
         evaluation=evaluation,
-        provenance=_provenance(sessions, recipe, imager, response, accepted.ignored),
         simulated=any(s.simulated for s in sessions),
         field=model.field,
         crosstalk=presses.crosstalk,
@@ -171,21 +183,21 @@ def _calibration(sessions: Sequence[Session], found: _Found, recipe: Recipe, acc
         locator=imager.locator if model.field is not None else None,
         baseline=response.baseline,
         image_gain=float(presses.data.force.sum() / found.images.integral.sum()),
-        loops=typical_loops(presses, _gains(model, found.images)),
-        tried=choice.tried,
+        loops=typical_loops(presses, found.gain),
+        tried=response.choice.tried,
         examples=press_examples(presses, found.skin),
         probes=press_probes(presses),
         rest=np.mean([recording.rest.mean(0) for recording in presses.recordings], 0),
         electrodes=found.placed,
         sensor=presses.sensor_noise,
+        provenance=_provenance(sessions, recipe, imager, response, ignored),
     )
 
 
 def _notes(found: _Found, evaluation: Evaluation) -> tuple[str, ...]:
     """What the operator should know of the stages."""
     presses, choice = found.presses, found.response.choice
-    unpressed = unpressed_note(found.response.model.field, found.images.places, presses.data.share)
-    harm = correction_that_harms(evaluation) if found.response.model.field is not None else ""
+    harm = correction_that_harms(evaluation) if found.model.field is not None else ""
     needed = import_note(choice.curve, choice.field, found.imager.locator)
     return (
         *presses.notes,
@@ -194,7 +206,7 @@ def _notes(found: _Found, evaluation: Evaluation) -> tuple[str, ...]:
         *([f"chosen: {choice.why}"] if choice.why else []),
         *_not_predicted(found.skin, found.held_out.pad_force),
         *_contradictions(found),
-        *filter(None, [unpressed, harm, needed]),
+        *filter(None, [found.unpressed, harm, needed]),
     )
 
 

@@ -197,8 +197,8 @@ def locate(
             # m
             print(calib.locate(locator, dv[strongest : strongest + 1], mine.recon, mine.masks).position)
     """
-    frames = np.asarray(dv, recon.dtype)
-    images = recon(jnp.asarray(frames)) if image is None else image
+    images = recon(jnp.asarray(dv, recon.dtype)) if image is None else image
+    frames = np.asarray(dv, images.dtype)
     places: Places = _by_rows(lambda dv, image: locator(dv, image, recon, masks), frames, images)
     return places
 

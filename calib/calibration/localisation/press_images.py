@@ -58,14 +58,14 @@ class Imager:
 
     def presses(self, dv: np.ndarray) -> PressImages:
         """Images of presses (presses, readings) V, each of which holds one contact."""
-        recon = self.recon
+        recon, one = self.recon, None if self.locator is None else self.locator.single()
         image = recon(jnp.asarray(dv, recon.dtype))
         estimated = {n: np.asarray(e(image, recon), float) for n, e in REPORTED_ESTIMATORS.items()}
         places = None
-        if self.locator is not None:
-            places = locate(self.locator.single(), dv, recon, self.masks, image)
+        if one is not None:
+            places = locate(one, dv, recon, self.masks, image)
             estimated["fitted"] = np.asarray(places.position[:, 0], float)
-        integral = np.asarray(je.metrics.image_sum(image, recon.areas), float)
+        integral = np.asarray(je.metrics.image_sum(image, self.masks.areas), float)
         return PressImages(np.asarray(image), integral, estimated, places)
 
 
