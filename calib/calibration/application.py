@@ -94,12 +94,9 @@ def apply(
         attrs["load_settings"] = load_settings.changed()
     for line in (*found.warnings, *outside):
         tell(f"note: {line}")
-    (sizes, coordinates), kinds = _coordinates(calibration), _rows(calibration, session.epoch)
+    coordinates, kinds = _coordinates(calibration), _rows(calibration, session.epoch)
     with ArchiveWriter(path, FORCE_MAP_FORMAT, {name: value for name, value in attrs.items() if value != ""}) as writer:
-        for name, about in coordinates.items():
-            writer.add(name, *about)
-        for name, (dims, units, meaning, dtype) in kinds.items():  # arrays with a row for each frame
-            writer.add_rows(name, tuple(sizes[dim] for dim in dims), units, meaning, dtype, ("time", *dims))
+        _begin_rows(writer, *coordinates, kinds)
         also: list[_Loads | _Tracks] = []
         if loads is not None:
             fit = partial(fit_windows, calibration, progress=progress, proposal=proposed, settings=load_settings)
@@ -120,6 +117,19 @@ def _agreement(calibration: Calibration, session: Session, blocks: FrameBlocks) 
     calibration, outside = agreement_of_use(calibration, session)
     doubt = placement_note(calibration.skin, blocks.untouched(), np.asarray(calibration.recon.channels))
     return calibration, (*outside, doubt) if doubt else outside
+
+
+def _begin_rows(
+    writer: ArchiveWriter,
+    sizes: Mapping[str, int],
+    coordinates: Mapping[str, _Coordinate],
+    kinds: Mapping[str, tuple[tuple[str, ...], str, str, str]],
+) -> None:
+    """Write all coordinates but time, and begin the arrays with a row for each frame."""
+    for name, about in coordinates.items():
+        writer.add(name, *about)
+    for name, (dims, units, meaning, dtype) in kinds.items():
+        writer.add_rows(name, tuple(sizes[dim] for dim in dims), units, meaning, dtype, ("time", *dims))
 
 
 def _attributes(calibration: Calibration, session: Session) -> dict[str, str | int]:
