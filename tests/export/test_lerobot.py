@@ -11,6 +11,7 @@ import calib
 from calib.cli import main
 from calib.export import ExportError, export_lerobot
 from calib.export.lerobot import dataset as lerobot_dataset, files as lerobot_files
+from calib.export.lerobot.dataset import due_times, held_rows
 from calib.export.lerobot.stats import FeatureStats, aggregated
 from calib.session import ArchiveWriter, SessionError
 
@@ -146,6 +147,50 @@ def test_many_episodes_are_spread_over_files(sources, tmp_path, monkeypatch):
     for row, name in zip(rows, names, strict=True):
         index = parquet.read_table(tmp_path / "set" / name)["index"].to_pylist()
         assert index == [*range(row["dataset_from_index"], row["dataset_to_index"])]
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1e-6, 1e-3, 0.1])
+@pytest.mark.parametrize("rate", [20, 24, 30, 48, 60, 90, 120, 144, 180])
+def test_equal_rates_give_one_frame_for_each_force_map(rate, jitter):
+    """Session times are rounded to whole ns, and devices are early and late by a part of the period."""
+    for seed in range(5):
+        late = np.random.default_rng(seed).uniform(-jitter, jitter, 3000)
+        times = np.round(7 * S + (np.arange(3000) + late) * S / rate).astype("i8")
+        due = due_times(times, rate)
+        np.testing.assert_array_equal(held_rows(times, rate, due), np.arange(3000))
+        assert 0 <= due.delay <= 2 * jitter * S / rate + 1
+
+
+def test_a_few_late_force_maps_do_not_move_the_others():
+    rng = np.random.default_rng(3)
+    times = np.arange(3000) * S / 60 + rng.normal(0, 1e-4, 3000) * S
+    late = rng.choice(np.arange(1, 2999), 30, replace=False)
+    times[late] += rng.uniform(0.5, 0.9, 30) * S / 60
+    times = np.round(times).astype("i8")
+    rows = held_rows(times, 60, due_times(times, 60))
+    assert len(rows) == 3000
+    assert set(np.flatnonzero(rows != np.arange(3000))) <= set(late)
+
+
+@pytest.mark.parametrize(("rate", "fps"), [(100, 30), (60, 24), (20, 50), (40, 20), (30, 60)])
+def test_other_rates_hold_the_last_force_map(rate, fps):
+    times = np.round(np.arange(600) * S / rate).astype("i8")
+    due = due_times(times, fps)
+    exact = [step * rate // fps for step in range(599 * fps // rate + 1)]
+    np.testing.assert_array_equal(held_rows(times, fps, due), exact)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1e-3])
+def test_no_age_is_negative_at_the_default_rate(jitter, tmp_path):
+    late = np.random.default_rng(1).uniform(0, jitter, 60)
+    arrays = force_map(tmp_path / "m.h5", np.round(5 * S + (np.arange(60) / 48 + late) * S).astype("i8"))
+    assert export_lerobot([tmp_path / "m.h5"], tmp_path / "set").frames == 60
+    table = parquet.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
+    np.testing.assert_array_equal(
+        np.array(table["observation.state"].to_pylist(), "f4"), arrays["pad_force"].astype("f4")
+    )
+    ages = np.array(table["observation.frame_age"].to_pylist())
+    assert 0 <= ages.min() <= ages.max() <= jitter + 1e-8
 
 
 def test_statistics_block_by_block_are_those_of_all_frames():

@@ -27,6 +27,9 @@ STATE, VALID, MAP, IMAGE, AGE = (
 )
 MAX_REPEATS = 10  # of each force map, by a rate of frames above its own
 MAX_STRETCH = 100  # of a recording by gaps, which become repeated frames
+SECOND = 10**9  # ns
+LONGEST_ARC = 0.4  # of a period, within which force maps that come once a period arrive
+PROMPT_SHARE = 0.98  # of the force maps; the others may be later
 ROUND_SCALES = (1.0, 2.0, 5.0, 10.0)
 
 
@@ -64,8 +67,9 @@ def export_lerobot(
 ) -> DatasetSummary:
     """Write force maps of `calib.apply` as a LeRobot dataset of version 3.0; it appears only when complete.
 
-    ``docs/lerobot.md`` lists the features. Each source is an episode. Its frames are at even distances of 1 / fps, and
-    each is the last frame of the force map that had arrived by then.
+    ``docs/lerobot.md`` lists the features. Each source is an episode. Its frames are due at even distances of 1 / fps,
+    and each is the last force map that had arrived by then. At the rate of the force maps the frames are due just after
+    these arrive, early and late ones alike, so that none is repeated or left out.
 
     Args:
         output: a folder that does not exist.
@@ -211,10 +215,12 @@ def _write_frames(
         for number, source in enumerate(progress(sources)):
             with open_archive(source, FORCE_MAP_FORMAT) as archive:
                 times = archive.arrays["time"].read()
-                rows = held_rows(times, fps)
+                due = due_times(times, fps)
+                rows = held_rows(times, fps, due)
+                ages = np.arange(len(rows)) / fps + (due.delay - (times[rows] - times[0])) / SECOND
                 stats = {name: FeatureStats(len(rows), channels=name == IMAGE) for name in features}
                 place = files.begin_episode()
-                for columns in _blocks(archive, times, rows, fps, full_scale, first, number, features[MAP]["shape"]):
+                for columns in _blocks(archive, ages, rows, fps, full_scale, first, number, features[MAP]["shape"]):
                     for name, part in stats.items():
                         part.add(columns[name] / 255 if name == IMAGE else columns[name])
                     pictures = [png_of(np.repeat(grey[..., None], 3, -1)) for grey in columns[IMAGE]]
@@ -228,17 +234,43 @@ def _write_frames(
     return episodes, {name: aggregated([one[name] for one in every]) for name in features}
 
 
-def held_rows(times: np.ndarray, fps: int) -> np.ndarray:
-    """Rows of the frames, with times in ns, that are the last to have arrived at even distances from the first on."""
-    steps = int((times[-1] - times[0]) * fps // 10**9) + 1
-    due = times[0] + (np.arange(steps) * 10**9) // fps
-    rows: np.ndarray = np.searchsorted(times, due, "right") - 1
+class DueTimes(NamedTuple):
+    """When the frames of an episode are due: ``delay`` after its first force map, and at even distances from there."""
+
+    frames: int
+    delay: int  # ns
+
+
+def due_times(times: np.ndarray, fps: int) -> DueTimes:
+    """Due times for force maps with times in ns, such that equal rates give one frame for each force map.
+
+    Force maps that come once a period arrive at nearly the same part of it, early and late ones within a short arc of
+    that circle. The frames are due at the end of the arc; where there is none, from the first force map on.
+    """
+    parts = np.sort((times - times[0]) * fps % SECOND)  # of a period, in units of 1e-9
+    circle = np.append(parts, parts + SECOND)
+    counts = np.searchsorted(circle, parts + int(LONGEST_ARC * SECOND), "left") - np.arange(len(parts))
+    start = int(np.argmax(counts))
+    slack, delay = fps, 0  # one ns: times are rounded
+    if counts[start] >= PROMPT_SHARE * len(parts):
+        end = int(circle[start + counts[start] - 1])
+        slack, delay = end - int(parts[start]) + fps, -(-(end % SECOND) // fps)
+    return DueTimes(int(((times[-1] - times[0]) * fps + slack) // SECOND) + 1, delay)
+
+
+def held_rows(times: np.ndarray, fps: int, due: DueTimes) -> np.ndarray:
+    """Rows of the force maps, with times in ns, that are the last to have arrived when each frame is due.
+
+    A force map one ns late is in time: both times are rounded.
+    """
+    at = times[0] + due.delay + (np.arange(due.frames) * SECOND) // fps
+    rows: np.ndarray = np.searchsorted(times, at + 1, "right") - 1
     return rows
 
 
 def _blocks(
     archive: ArchiveReader,
-    times: np.ndarray,
+    ages: np.ndarray,
     rows: np.ndarray,
     fps: int,
     full_scale: float,
@@ -262,7 +294,7 @@ def _blocks(
             VALID: valid > 0,
             MAP: np.ascontiguousarray(maps, np.float32),
             IMAGE: grey_images(maps, full_scale),
-            AGE: (number / fps - (times[chosen] - times[0]) / 1e9).astype(np.float32),
+            AGE: np.maximum(ages[number], 0).astype(np.float32),
             "timestamp": (number / fps).astype(np.float32),
             "frame_index": number,
             "episode_index": np.full(count, episode),
