@@ -1,6 +1,7 @@
 """A batch whose sessions take no time to calibrate, to be killed.
 
     python -m tests.batch_worker MADE LOG OUT SESSION...
+    python -m tests.batch_worker held MADE GATE calibrate ...
 
 Workers give every session the calibration MADE, and write a line to LOG for each result that they have saved.
 """
@@ -8,8 +9,11 @@ Workers give every session the calibration MADE, and write a line to LOG for eac
 import multiprocessing
 import os
 import sys
+import time
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 
+from calib import cli
 from calib.batch import sessions as batch
 from calib.batch.workers import begin
 from calib.calibration.calibration import Calibration, load_calibration
@@ -48,6 +52,29 @@ def deadly_pool(jobs: int, made: str) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(jobs, mp_context=context, initializer=begin_deadly, initargs=(made,))
 
 
+def begin_held(made: str, gate: str) -> None:
+    """Every session says in the folder ``gate`` that it has begun, and waits there for the file ``go``."""
+    begin()
+    ready = load_calibration(made)
+
+    def calibrate(sessions, skin, **options):
+        Path(gate, sessions[0].name).touch()
+        while not Path(gate, "go").exists():
+            time.sleep(0.02)
+        return ready
+
+    batch.calibrate = calibrate
+
+
+def held_command(made: str, gate: str, *words: str) -> int:
+    """The command line, with workers that wait."""
+    context = multiprocessing.get_context("spawn")
+    batch.spawned_pool = lambda jobs: ProcessPoolExecutor(
+        jobs, mp_context=context, initializer=begin_held, initargs=(made, gate)
+    )
+    return cli.main(words)
+
+
 def main(made: str, log: str, out: str, *sessions: str) -> None:
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(2, mp_context=context, initializer=begin_quick, initargs=(made, log)) as pool:
@@ -55,4 +82,6 @@ def main(made: str, log: str, out: str, *sessions: str) -> None:
 
 
 if __name__ == "__main__":
+    if sys.argv[1] == "held":
+        sys.exit(held_command(*sys.argv[2:]))
     main(*sys.argv[1:])

@@ -9,10 +9,18 @@ one folder share the work.
 import contextlib
 import os
 import pickle
-import re
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future, as_completed
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    as_completed,
+    wait,
+)
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -31,13 +39,9 @@ from ..runtime import settings, take_over
 from ..session import Session, SessionError, open_session
 from ..session.given import paths_of, require_skin_or_none
 from .digests import describe, digest
+from .locks import exclusive, lock_of, remove_unfinished
 from .logs import ensure_log_calibration
-from .workers import ONE_AT_A_TIME, spawned_pool
-
-try:
-    import fcntl
-except ImportError:  # a system without it
-    fcntl = None  # type: ignore[assignment]
+from .workers import ONE_AT_A_TIME, end_workers, spawned_pool
 
 _DIED = "its worker process died, most likely for want of memory; try it alone, or on a machine with more"
 _SESSIONS_PER_WORKER = 16  # then a worker is replaced: each new skin leaves its compiled programs in memory
@@ -93,6 +97,7 @@ def calibrate_many(
     jobs: int | None = None,
     report: bool = False,
     tell: Callable[[Outcome], object] = lambda outcome: None,
+    finishing: Callable[[int], object] = lambda running: None,
 ) -> tuple[Outcome, ...]:
     """Calibrate every session by itself: ``out/NAME.h5`` for ``NAME.h5``, in the order given.
 
@@ -105,6 +110,10 @@ def calibrate_many(
         jobs: number of processes of the default pool; default: one per core.
         report: whether to write ``out/NAME.html`` too.
         tell: called with the outcome of each session when the session ends.
+        finishing: called with the number of sessions that still run, after a `KeyboardInterrupt`.
+
+    After a first `KeyboardInterrupt` no other session begins, and it is raised again when those that run have ended; a
+    second one ends the processes of the default pool at once. The same call goes on with what is not done.
 
     A session without EIT is a log of force and pressure: it gets the calibration of a log, as by `jaxeit calibrate`.
     The outcome of a session that fails names the reason, and the other sessions complete. The default pool also
@@ -135,9 +144,9 @@ def calibrate_many(
         tell(outcome)
 
     if executor is None:
-        _run_in_pools(tasks, jobs or os.cpu_count() or 1, note)
+        _run_in_pools(tasks, jobs or os.cpu_count() or 1, note, finishing)
     else:
-        for task in _run(executor, tasks, note):
+        for task in _run(executor, tasks, len(tasks), note, finishing):
             note(_failed(task, _DIED))
     return tuple(outcomes[task.session] for task in tasks)
 
@@ -201,45 +210,90 @@ def _line(outcome: Outcome, width: int) -> str:
 # --- running -------------------------------------------------------------------------------------
 
 
-def _run_in_pools(tasks: Sequence[_Task], jobs: int, note: Callable[[Outcome], None]) -> None:
+def _run_in_pools(
+    tasks: Sequence[_Task], jobs: int, note: Callable[[Outcome], None], finishing: Callable[[int], object]
+) -> None:
     """Run the tasks in pools of processes; a session whose worker died is tried once more in a process of its own."""
     left = list(tasks)
-    while left:
-        now, later = left[: jobs * _SESSIONS_PER_WORKER], left[jobs * _SESSIONS_PER_WORKER :]
-        with spawned_pool(min(jobs, len(now))) as pool:
-            broken = _run(pool, now, note)
-        suspects = [task for task in broken if _lock_of(task.calibration).exists()] or broken[:1]
-        for task in suspects:
-            with spawned_pool(1) as alone:
-                died = bool(_run(alone, [task], note))
-            if died:
-                _lock_of(task.calibration).unlink(missing_ok=True)
-                note(_failed(task, _DIED))
-        left = [task for task in broken if task not in suspects] + later
-
-
-def _run(executor: Executor, tasks: Sequence[_Task], note: Callable[[Outcome], None]) -> list[_Task]:
-    """Submit all tasks and collect their outcomes; returns the tasks that a broken executor did not do."""
-    futures: dict[Future[Outcome], _Task] = {}
-    broken = list(tasks)
     try:
-        with contextlib.suppress(BrokenExecutor):
-            for task in tasks:
-                futures[executor.submit(calibrate_one, task)] = task
-        for future in as_completed(futures):
-            task = futures[future]
-            try:
-                outcome = future.result()
-            except BrokenExecutor:
-                continue
-            except Exception as error:  # errors of the scheduler itself, of any type
-                outcome = _failed(task, _error_text(error))
+        while left:
+            now, later = left[: jobs * _SESSIONS_PER_WORKER], left[jobs * _SESSIONS_PER_WORKER :]
+            with _pool(min(jobs, len(now))) as pool:
+                broken = _run(pool, now, jobs, note, finishing)
+            suspects = [task for task in broken if lock_of(task.calibration).exists()] or broken[:1]
+            for task in suspects:
+                with _pool(1) as alone:
+                    died = bool(_run(alone, [task], 1, note, finishing))
+                if died:
+                    lock_of(task.calibration).unlink(missing_ok=True)
+                    note(_failed(task, _DIED))
+            left = [task for task in broken if task not in suspects] + later
+    except KeyboardInterrupt:
+        for task in tasks:
+            remove_unfinished(task.calibration)
+        raise
+
+
+@contextlib.contextmanager
+def _pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
+    """A pool of processes, which an interruption ends at once: `_run` has awaited those that it is to await."""
+    with spawned_pool(jobs) as pool:
+        try:
+            yield pool
+        except KeyboardInterrupt:
+            end_workers(pool)
+            raise
+
+
+def _run(
+    executor: Executor,
+    tasks: Sequence[_Task],
+    at_once: int,
+    note: Callable[[Outcome], None],
+    finishing: Callable[[int], object],
+) -> list[_Task]:
+    """Run all tasks and collect their outcomes; returns the tasks that a broken executor did not do.
+
+    Args:
+        at_once: number of tasks that are submitted and not done. One that is submitted may begin after an interruption.
+    """
+    waiting, broken = deque(tasks), list(tasks)
+    futures: dict[Future[Outcome], _Task] = {}
+
+    def collect(future: Future[Outcome]) -> None:
+        task = futures.pop(future)
+        outcome = _outcome_of(future, task)
+        if outcome is not None:
             broken.remove(task)
             note(outcome)
-    finally:
-        for future in futures:
-            future.cancel()  # after an interruption, the tasks that have not begun
+
+    try:
+        while waiting or futures:
+            with contextlib.suppress(BrokenExecutor):
+                while waiting and len(futures) < at_once:
+                    futures[executor.submit(calibrate_one, waiting[0])] = waiting[0]
+                    waiting.popleft()
+            if not futures:
+                break  # the executor takes no more
+            for future in wait(futures, return_when=FIRST_COMPLETED).done:
+                collect(future)
+    except KeyboardInterrupt:
+        running = [future for future in futures if not future.cancel()]
+        finishing(sum(not future.done() for future in running))
+        for future in as_completed(running):
+            collect(future)
+        raise
     return broken
+
+
+def _outcome_of(future: Future[Outcome], task: _Task) -> Outcome | None:
+    """The outcome of a task that has ended; None if its executor broke."""
+    try:
+        return future.result()
+    except BrokenExecutor:
+        return None
+    except Exception as error:  # errors of the scheduler itself, of any type
+        return _failed(task, _error_text(error))
 
 
 def _failed(task: _Task, reason: str, seconds: float = 0.0) -> Outcome:
@@ -261,7 +315,7 @@ def calibrate_one(task: _Task) -> Outcome:
     with ONE_AT_A_TIME:
         take_over(task.settings)
         try:
-            with _exclusive(task.calibration):
+            with exclusive(task.calibration):
                 return replace(_do_task(task), seconds=time.perf_counter() - start)
         except Exception as error:
             reason = _error_text(error).removeprefix(f"{Path(task.session).name}: ")
@@ -316,40 +370,3 @@ def _ensure_report(task: _Task, calibration: Calibration) -> bool:
 
 def _page_of(task: _Task) -> Path:
     return Path(task.calibration).with_suffix(".html")
-
-
-def _lock_of(calibration: str) -> Path:
-    path = Path(calibration)
-    return path.with_name(f".{path.name}.lock")
-
-
-@contextlib.contextmanager
-def _exclusive(calibration: str) -> Iterator[None]:
-    """Hold the lock of a task while others wait, remove their unfinished files, and remove the lock file at the end.
-
-    A worker that dies leaves the file, but not the lock.
-    """
-    lock = _lock_of(calibration)
-    file = _open_locked(lock)
-    try:
-        own = re.compile(rf"\.{re.escape(Path(calibration).stem)}(\.h5|\.html|_[a-z]+\.png)\.[0-9a-f]+\.tmp")
-        for name in filter(own.fullmatch, os.listdir(lock.parent)):
-            lock.with_name(name).unlink(missing_ok=True)
-        yield
-    finally:
-        lock.unlink(missing_ok=True)
-        os.close(file)
-
-
-def _open_locked(path: Path) -> int:
-    """Open and lock the lock file; the result is the file of that name, not one that its last owner has removed."""
-    while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        if fcntl is None:
-            return file
-        with contextlib.suppress(OSError):  # some file systems have no locks
-            fcntl.flock(file, fcntl.LOCK_EX)
-        with contextlib.suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(file), os.stat(path)):
-                return file
-        os.close(file)

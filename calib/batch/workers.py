@@ -25,13 +25,19 @@ def spawned_pool(jobs: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=begin)
 
 
+def end_workers(pool: ProcessPoolExecutor) -> None:
+    """End the workers at once, whatever they do; the pool is broken then, and shuts down without waiting for them."""
+    for worker in list((pool._processes or {}).values()):
+        worker.kill()
+
+
 def begin() -> None:
     """One thread of computation; a worker outlives neither its parent nor, by Ctrl-C, what it has begun."""
     own = {name: value for name, value in ONE_THREAD.items() if name != "XLA_FLAGS"}
     flags = f"{os.environ.get('XLA_FLAGS', '')} {ONE_THREAD['XLA_FLAGS']}".strip()
     os.environ.update(own | {"XLA_FLAGS": flags})
     with contextlib.suppress(ValueError):  # not in the main thread
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is told, and lets us finish
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is told, and lets us finish, or kills us
     parent = parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()

@@ -1,5 +1,6 @@
 """Many sessions: each its own result, failures named, nothing done twice, nothing lost."""
 
+import contextlib
 import json
 import os
 import shutil
@@ -279,6 +280,138 @@ def test_a_session_that_kills_its_worker_is_named_and_the_rest_complete(made, bu
     assert sorted(os.listdir(out)) == ["a.h5", "c.h5", "d.h5"]
 
 
+# --- interruptions -------------------------------------------------------------------------------
+
+
+class Running(Here):
+    """A pool of two workers that do what they are given when they are told to, and never stop."""
+
+    def __init__(self):
+        super().__init__()
+        self.given = []
+
+    def submit(self, call, task):
+        future = Future()
+        future.set_running_or_notify_cancel()
+        self.given.append((future, call, task))
+        if len(self.given) == 1:
+            self.finish(0)
+        return future
+
+    def finish(self, number):
+        future, call, task = self.given[number]
+        future.set_result(call(task))
+
+
+def test_after_an_interruption_what_runs_ends_and_nothing_begins(quick, sessions, tmp_path, monkeypatch):
+    pool, ended = Running(), []
+    monkeypatch.setattr(batch, "spawned_pool", lambda jobs: pool)
+    monkeypatch.setattr(batch, "end_workers", ended.append)
+    told, running = [], []
+
+    def tell(outcome):
+        told.append(outcome.session)
+        if len(told) == 1:
+            raise KeyboardInterrupt  # as by Ctrl-C
+
+    def finishing(count):
+        running.append(count)
+        pool.finish(1)
+
+    with pytest.raises(KeyboardInterrupt):
+        batch.calibrate_many(sessions, tmp_path / "out", jobs=2, tell=tell, finishing=finishing)
+    assert running == [1]
+    assert told == sessions[:2]
+    assert quick == ["s0.h5", "s1.h5"]
+    assert len(pool.given) == 2
+    assert ended == [pool]
+    assert sorted(os.listdir(tmp_path / "out")) == ["s0.h5", "s1.h5"]
+
+
+def test_a_second_interruption_ends_the_workers_and_leaves_nothing_unfinished(quick, sessions, tmp_path, monkeypatch):
+    pool, ended, out = Running(), [], tmp_path / "out"
+    monkeypatch.setattr(batch, "spawned_pool", lambda jobs: pool)
+    monkeypatch.setattr(batch, "end_workers", ended.append)
+    told = []
+
+    def interrupt(what):
+        told.append(what)
+        raise KeyboardInterrupt
+
+    out.mkdir()
+    # Of the worker that is killed, and of another batch, which goes on.
+    for name in (".s1.h5.lock", ".s1.h5.0123456789ab.tmp", ".s2.h5.0123456789ab.tmp"):
+        (out / name).touch()
+    with locked(out / ".s2.h5.lock"), pytest.raises(KeyboardInterrupt):
+        batch.calibrate_many(sessions, out, jobs=2, tell=interrupt, finishing=interrupt)
+    assert told[1:] == [1]
+    assert ended == [pool]
+    assert sorted(os.listdir(out)) == [".s2.h5.0123456789ab.tmp", ".s2.h5.lock", "s0.h5"]
+
+
+@contextlib.contextmanager
+def locked(path):
+    """The lock file of another process."""
+    fcntl = pytest.importorskip("fcntl")
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def test_the_command_says_what_an_interrupted_batch_has_written(quick, sessions, tmp_path, monkeypatch, capsys):
+    pool = Running()
+    monkeypatch.setattr(batch, "spawned_pool", lambda jobs: pool)
+    monkeypatch.setattr(batch, "end_workers", lambda pool: None)
+    real = batch.calibrate_many
+
+    def interrupted(*args, tell, finishing, **options):
+        def tell_and_interrupt(outcome):
+            tell(outcome)
+            if outcome.session == sessions[0]:
+                raise KeyboardInterrupt
+
+        def finish(running):
+            finishing(running)
+            pool.finish(1)
+
+        return real(*args, tell=tell_and_interrupt, finishing=finish, **options)
+
+    monkeypatch.setattr(batch, "calibrate_many", interrupted)
+    assert main(["calibrate", *sessions, "-o", str(tmp_path / "out"), "--jobs", "2"]) == 130
+    said = capsys.readouterr().err.splitlines()
+    assert said == [
+        "jaxeit: finishing 1 session; Ctrl-C again to stop now",
+        f"jaxeit: interrupted; 2 of 4 calibrations are in {tmp_path / 'out'}; the same command goes on",
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [1, 2])
+def test_ctrl_c_ends_a_batch(times, made, sessions, tmp_path):
+    """Once: those that run are written; twice: at once, with nothing half-written, and no process stays."""
+    gate, out = tmp_path / "gate", tmp_path / "out"
+    gate.mkdir()
+    command = [sys.executable, "-m", "tests.batch_worker", "held", str(made[0] / "testbed_grid.h5"), str(gate)]
+    command += ["calibrate", *sessions, "-o", str(out), "--jobs", "2"]
+    with subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE, text=True) as running:
+        deadline = time.monotonic() + 200
+        while len(os.listdir(gate)) < 2:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        os.killpg(running.pid, signal.SIGINT)  # as a terminal does
+        assert "finishing 2 sessions; Ctrl-C again to stop now" in running.stderr.readline()
+        if times == 1:
+            (gate / "go").touch()
+        else:
+            os.killpg(running.pid, signal.SIGINT)
+        told = running.stderr.read()  # to its end, when no process has it open
+        assert running.wait(100) == 130
+    assert f"{2 if times == 1 else 0} of 4 calibrations are in {out}; the same command goes on" in told
+    assert "Traceback" not in told
+    assert sorted(os.listdir(out)) == (["s0.h5", "s1.h5"] if times == 1 else [])
+    assert sorted(set(os.listdir(gate)) - {"go"}) == ["s0.h5", "s1.h5"]
+
+
 # --- logs without EIT ----------------------------------------------------------------------------
 
 
@@ -300,7 +433,7 @@ def logs(tmp_path):
 
 
 def test_logs_without_eit_get_the_curves_that_they_get_singly(logs, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(batch, "_run_in_pools", lambda tasks, jobs, note: batch._run(Here(), tasks, note))
+    monkeypatch.setattr(batch, "_run_in_pools", lambda tasks, jobs, *told: batch._run(Here(), tasks, jobs, *told))
     words = ["calibrate", *logs, "-o", str(tmp_path / "out"), "--jobs", "2", "--json"]
     capsys.readouterr()
     assert main(words) == 2

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -13,7 +14,7 @@ from ...calibration.recipe_text import NONE, SWITCHES
 from ...session import Session
 from ..arguments import count, prepare_results, require_matplotlib_for, skin_of
 from ..recipe_options import IMAGING, add_recipe_arguments, recipe_of
-from ..terminal import announce_model, show, stage_bar, title
+from ..terminal import announce_model, say_interrupted, show, stage_bar, title
 
 if TYPE_CHECKING:
     from ...calibration import Calibration
@@ -129,22 +130,36 @@ def _calibrate_many(args: argparse.Namespace) -> int:
         executor = stack.enter_context(dask_executor(args.scheduler)) if args.scheduler else None
         bar = stack.enter_context(tqdm(total=len(args.sessions), desc="sessions", disable=None, leave=False))
 
+        written = set()
+
         def tell(outcome: Outcome) -> None:
             bar.update()
-            if outcome.reason:
+            if not outcome.reason:
+                written.add(outcome.session)
+            else:
                 tqdm.write(f"jaxeit: {Path(outcome.session).name}: {outcome.reason}", file=sys.stderr)
 
-        outcomes = calibrate_many(
-            args.sessions,
-            args.output,
-            executor=executor,
-            jobs=args.jobs,
-            report=args.report is not None,
-            tell=tell,
-            recipe=recipe_of(args),
-            skin=skin_of(args.skin),
-            ignore_errors=args.force,
-        )
+        def finishing(running: int) -> None:
+            sessions = f"{running} session{'s' * (running != 1)}"
+            tqdm.write(f"jaxeit: finishing {sessions}; Ctrl-C again to stop now", file=sys.stderr)
+
+        try:
+            outcomes = calibrate_many(
+                args.sessions,
+                args.output,
+                executor=executor,
+                jobs=args.jobs,
+                report=args.report is not None,
+                tell=tell,
+                finishing=finishing,
+                recipe=recipe_of(args),
+                skin=skin_of(args.skin),
+                ignore_errors=args.force,
+            )
+        except KeyboardInterrupt as interrupt:
+            total = len({os.path.abspath(path) for path in args.sessions})
+            what = f"{len(written)} of {total} calibrations are in {args.output}; the same command goes on"
+            return say_interrupted(interrupt, what)
     if args.json:
         print(json.dumps({o.session: o.summary or {"failed": o.reason} for o in outcomes}, indent=2, sort_keys=True))
     else:
