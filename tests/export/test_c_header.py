@@ -423,9 +423,17 @@ def test_two_skins_in_one_program(calibration, tmp_path):
     source = '#include "left_arm.h"\n#include "right.h"\nint main(void)\n{\n    return LEFT_ARM_PADS - RIGHT_PADS;\n}\n'
     program = built(tmp_path, source=source)
     assert subprocess.run([program], check=False).returncode == 0
-    fast = subprocess.run(
-        [CC, "-ffast-math", "main.c", "-o", "fast"], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+
+
+@needs_compiler
+@pytest.mark.parametrize("option", ["-ffast-math", "-Ofast", "-ffinite-math-only"])
+def test_options_that_take_nan_for_impossible_are_refused(option, calibration, tmp_path):
+    calib.export_c(calibration, tmp_path / "skin.h")
+    (tmp_path / "main.c").write_text('#include "skin.h"\nint main(void)\n{\n    return 0;\n}\n')
+    command = [CC, "main.c", "-o", "program"]
+    assert subprocess.run(command, cwd=tmp_path, check=False).returncode == 0
+    fast = subprocess.run([*command, option], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert fast.returncode != 0
     assert "compile without -ffast-math" in fast.stderr
 
 

@@ -4,8 +4,8 @@
 #include <math.h>
 #include <stdint.h>
 
-#ifdef __FAST_MATH__
-#error "compile without -ffast-math: a missing reading or pressure is NaN, which that option takes for impossible"
+#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
+#error "compile without -ffast-math, -Ofast and -ffinite-math-only: a missing reading is NaN, which they take for impossible"
 #endif
 
 /*@SIZES@*/
