@@ -1,9 +1,11 @@
 """Handle signals that end a command, so that temporary files are removed and a recording is finished."""
 
+import os
 import signal
+import socket
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -14,6 +16,8 @@ if TYPE_CHECKING:
 
 # After which an interruption that was dropped is raised again; s.
 AGAIN_AFTER = 0.05
+# In which a second signal may end a command in order, before its process is ended; s.
+LAST_GRACE = 1.0
 ENDING_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
@@ -100,3 +104,41 @@ def orderly_end(orders: "StopRequest", planned: bool) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def heard_at_once(first: Callable[[], object], last: Callable[[], object]) -> Iterator[None]:
+    """Within this context a thread hears signals while the main thread compiles, which handles none meanwhile.
+
+    Args:
+        first: called at the first signal that ends the command.
+        last: called when a second one has not ended this context in `LAST_GRACE`; then the process ends.
+    """
+    ended, numbers = threading.Event(), (signal.SIGINT, *ENDING_SIGNALS)
+    numbers = tuple(number for number in numbers if signal.getsignal(number) != signal.SIG_IGN)
+
+    def listen() -> None:
+        heard = 0
+        while number := reader.recv(1):
+            if number[0] not in numbers:
+                continue
+            heard += 1
+            if heard == 1:
+                first()
+            elif not ended.wait(LAST_GRACE):
+                last()
+                os._exit(128 + number[0])
+
+    reader, writer = socket.socketpair()
+    with reader, writer:
+        writer.setblocking(False)
+        before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+        listener = threading.Thread(target=listen, name="signals", daemon=True)
+        listener.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            signal.set_wakeup_fd(before)
+            writer.shutdown(socket.SHUT_WR)
+            listener.join()

@@ -41,6 +41,12 @@ MAX_WAIT = 10_000_000  # ns
 MAX_QUEUED_FRAMES = 16
 PERIOD_SMOOTHING = 0.1  # weight of a new interval in the mean interval between frames
 COMPILING = "compiling the programs of this calibration, before the devices are asked: up to a minute the first time"
+CHOOSING = "choosing the readings for each place of the skin"
+STOPPED = "stopped before the devices were asked"
+
+
+class _Stopped(Exception):
+    """A stop was requested while programs were compiled."""
 
 
 class LiveError(ValueError):
@@ -210,12 +216,16 @@ def run_live(
     """
     settings = settings or LiveSettings()
     control.state = COMPILING
-    engine, recalibrator = _engine(calibration, sources, control, settings)
+    try:
+        engine, recalibrator = _engine(calibration, sources, control, settings)
+        _go_on(control)
+    except _Stopped:
+        return 0
     queue = FrameQueue(*(source.plan for source in sources))
     recorder = Recorder(plan, sources, log or NullSink(), queue.put)
     director = None
     if settings.event_driven:
-        control.state = "choosing the readings for each place of the skin"
+        control.state = CHOOSING
         director = prepare_director(cast(Calibration, calibration), sources[0].plan.number, recorder.receivers[0].send)
     control.state = f"waiting for the first frame of {' and '.join(source.plan.name for source in sources)}"
     with real_time(settings.realtime), recorder:
@@ -244,21 +254,33 @@ def _engine(
         return LogEngine(calibration, settings.rest), None
     _check(calibration, sources)
     _check_rest(settings)
+    _go_on(control)
     follower = _follower(calibration, settings.track, control.warn) if settings.track else None
+    _go_on(control)
     recalibrator = None
     if settings.recalibrate:
         layer = None if follower is None else follower.learned
         recalibrator = LiveRecalibrator(calibration, settings.moved, tell=control.warn, layer=layer)
+    _go_on(control)
     proposal = chosen_proposal(settings.proposal, calibration.skin, control.warn)
+    check = rest_check(calibration)
+    _go_on(control)
     engine = Engine(
         calibration,
         settings.rest,
         recalibrator=recalibrator,
         follower=follower,
         proposal=proposal,
-        check=rest_check(calibration),
+        check=check,
     )
     return engine, recalibrator
+
+
+def _go_on(control: LiveControl) -> None:
+    """End what prepares the view if a stop was requested meanwhile."""
+    if control.stop.is_set():
+        control.state = STOPPED
+        raise _Stopped
 
 
 def _check(calibration: Calibration, sources: Sequence[Source]) -> None:

@@ -4,12 +4,15 @@ import errno
 import gc
 import os
 import signal
+import subprocess
+import sys
 import time
 
 import numpy as np
 import pytest
 
 from calib.cli import main
+from calib.live import presentation
 from calib.session.hdf5 import storage
 from tests.record.test_full_disk import SCENE
 from tests.record.test_recorder import both, journal
@@ -140,3 +143,43 @@ def test_an_interruption_within_a_collection_of_garbage_ends_the_command(number,
 
     monkeypatch.setattr("calib.cli.commands.doctor_command.run", run)
     assert main(["doctor"]) == status
+
+
+COMPILING = """
+import hashlib
+from calib.cli.signals import heard_at_once, orderly_end
+from calib.record.recorder import StopRequest
+heard = heard_at_once(lambda: print("first", flush=True), lambda: print("last", flush=True))
+with orderly_end(StopRequest(), planned=False), heard:
+    print("begun", flush=True)
+    hashlib.pbkdf2_hmac("sha256", b"password", b"salt", 10**9)  # minutes outside of Python, as a compiler takes
+"""
+
+
+def test_signals_are_heard_while_the_main_thread_handles_none():
+    with subprocess.Popen([sys.executable, "-c", COMPILING], stdout=subprocess.PIPE, text=True) as running:
+        assert running.stdout.readline() == "begun\n"
+        for word in ("first\n", "last\n"):
+            running.send_signal(signal.SIGINT)
+            assert running.stdout.readline() == word
+        assert running.wait(20) == 130
+
+
+@pytest.mark.parametrize("signals", [1, 2])
+def test_live_that_compiles_answers_ctrl_c(signals, calibrated, bundled, monkeypatch, capsys):
+    presses = next(path for path in bundled if path.stem == "testbed_presses")
+
+    def present(calibration, plan, sources, show, *args, **options):
+        for _ in range(signals):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.3)
+        assert show.stop.is_set()
+        return 0
+
+    monkeypatch.setattr(presentation, "present", present)
+    streams = [word for name in ("eit", "pressure") for word in (f"--{name}", f"replay://{presses}")]
+    words = ["live", "--calibration", str(calibrated), *streams]
+    assert main(words) == (0 if signals == 1 else 130)
+    told = capsys.readouterr().err.splitlines()
+    assert told[0] == "jaxeit: ends after what is being compiled; Ctrl-C again to end now"
+    assert ("jaxeit: interrupted; nothing was written" in told) == (signals == 2)

@@ -228,6 +228,18 @@ def test_a_zero_that_was_measured_in_mid_press_is_noticed_after_the_release(cali
     assert not engine.has_wrong_zero(9 * S)
 
 
+def test_a_stop_while_live_compiles_leaves_out_the_rest(calibration, monkeypatch):
+    """The steps that follow, and the devices."""
+    show, made = LiveControl(), []
+    monkeypatch.setattr(live_module, "rest_check", lambda calibration: show.stop.set())
+    monkeypatch.setattr(live_module, "Engine", lambda *args, **options: made.append("engine"))
+    monkeypatch.setattr(live_module, "Recorder", lambda *args: made.append("recorder"))
+    with small_device() as device:
+        assert run_live(calibration, *sources_of(device, calibration), [], show, LiveSettings(proposal=None)) == 0
+    assert made == []
+    assert show.state == "stopped before the devices were asked"
+
+
 def test_live_that_is_joined_in_mid_press_finds_its_zero(calibration):
     """Joined while 10 N rest on the first pad, which are taken away after a second."""
     show, results, told = LiveControl(), [], []

@@ -13,11 +13,11 @@ from ..arguments import (
     proposal_of,
     tracking_of,
 )
-from ..signals import orderly_end
+from ..signals import heard_at_once, orderly_end
 from ..terminal import say
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from contextlib import AbstractContextManager
 
     from ...calibration import Calibration, LogCalibration
@@ -96,7 +96,8 @@ def run(args: argparse.Namespace) -> int:
     orders = StopRequest()
     show = LiveControl(stop=orders.stop, warn=say)
     also: list[Publish] = [lambda result: print(result.to_json(), flush=True)] if args.json else []
-    with orderly_end(orders, planned=False), ExitStack() as stack:
+    first, last = _heard(args, show)
+    with orderly_end(orders, planned=False), heard_at_once(first, last), ExitStack() as stack:
         also += [stack.enter_context(viewer).show_result for viewer in _viewers(args, calibration, show)]
         count = present(
             calibration,
@@ -110,6 +111,28 @@ def run(args: argparse.Namespace) -> int:
         )
     say(f"{count} frames" if count else f"0 frames: {show.state}")
     return orders.status
+
+
+def _heard(args: argparse.Namespace, show: "LiveControl") -> "tuple[Callable[[], None], Callable[[], None]]":
+    """What a first signal says while programs are compiled, and what is done before a second one ends the process."""
+    from ...live.engine import PREPARING
+    from ...live.loop import CHOOSING, COMPILING
+    from ...record.recorder import journal_path
+
+    def first() -> None:
+        if show.state in (COMPILING, CHOOSING, PREPARING):
+            say("ends after what is being compiled; Ctrl-C again to end now")
+
+    def last() -> None:
+        journal = None if args.output is None else journal_path(args.output)
+        if journal is not None and show.state not in (COMPILING, CHOOSING):
+            say(f"interrupted; `jaxeit recover {journal}` makes the session")
+            return
+        if journal is not None:
+            journal.unlink(missing_ok=True)  # no device was asked yet
+        say("interrupted; nothing was written")
+
+    return first, last
 
 
 def _check_options(args: argparse.Namespace) -> None:
