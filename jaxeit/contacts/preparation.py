@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from .._compile import full_precision, require_known, verb
-from ..imaging.inputs import InverseError
+from ..imaging.inputs import InverseError, real_numbers
 from ..imaging.untouched import sheet_of
 from ..imaging.whitening import Whitened, whitened_readings
 from ..model.bases import Elements
@@ -24,6 +24,8 @@ from .settings import ContactSettings
 
 # Frames of noise that set the threshold.
 NOISE_FRAMES = 512
+# Least root mean square of whitened readings of bumps, along a direction in which contacts are sought.
+MIN_SIGNAL = 0.1
 # Widths of the atoms, as fractions of the way from the narrowest to the widest level of the table.
 ATOM_WIDTHS = (0.35, 0.6, 0.85)
 
@@ -74,7 +76,9 @@ def prepare_contacts(
     settings = settings or ContactSettings()
     nodes = table_nodes(model, settings.widths, settings.columns)
     slopes, background = _relative_jacobian(model, whitened, sigma)
-    signal, complement = signal_subspace(tabulate(model, slopes, nodes.subsample(3)))
+    table = tabulate(model, slopes, nodes.subsample(3))
+    signal, complement = signal_subspace(table, MIN_SIGNAL)
+    require_signal(signal.shape[1] > 0)
     values = tabulate(model, signal.T @ slopes, nodes)
     put = partial(jnp.asarray, dtype=model.dtype)
     bounds = contact_bounds(nodes.axes[1], nodes.axes[0], settings.widths)
@@ -114,7 +118,30 @@ def sheet_and_readings(
     require_known(name, InverseError, model, noise, untouched, sigma, channels)
     if noise is None:
         raise InverseError(f"{name}: noise is None; give the standard deviation of each reading, V")
+    _require_conductivity(sigma)
     return sheet_of(model, untouched, sigma, channels), whitened_readings(model, noise, channels)
+
+
+def _require_conductivity(sigma: object) -> None:
+    """Refuse a conductivity that no sheet has."""
+    if not hasattr(sigma, "shape"):
+        return  # none, or what `sheet_of` refuses
+    values = real_numbers("sigma", sigma, "S").ravel()
+    bad = ~(np.isfinite(values) & (values > 0))
+    if bad.any():
+        raise InverseError(
+            f"sigma of element {int(np.argmax(bad))} is {values[bad][0]:g} S; give the conductivity of each "
+            "element, a finite number above zero, or the frame of the untouched skin (untouched=)"
+        )
+
+
+def require_signal(found: bool) -> None:
+    """Refuse noise in which nothing can be found: no contact changes the whitened readings by `MIN_SIGNAL`."""
+    if not found:
+        raise InverseError(
+            f"the noise hides every contact: none changes the readings by {MIN_SIGNAL:g} of it; give the "
+            "standard deviation of each reading in V, such as 1e-6, as measured without contact"
+        )
 
 
 def _relative_jacobian(

@@ -292,6 +292,29 @@ def test_bad_noise_and_channels_are_refused(model, settings, message):
         prepare_contacts(model, **{"noise": np.full(550, STD), **settings})
 
 
+PREPARED = {
+    "contacts": prepare_contacts,
+    "loads": je.contacts.prepare_loads,
+    "tracker": lambda model, **given: je.tracking.prepare_tracker(model, je.load_skin("testbed"), **given),
+}
+
+
+@pytest.mark.parametrize("prepare", PREPARED.values(), ids=PREPARED)
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"noise": np.ones(550)}, "the noise hides every contact: .*; give the standard deviation of each reading"),
+        ({"sigma": lambda model: model.background * np.nan}, "sigma of element 0 is nan S; give the conductivity"),
+        ({"sigma": lambda model: -model.background}, "sigma of element 0 is -0.00666667 S; give the conductivity"),
+        ({"sigma": lambda model: model.background.at[7].set(0)}, "sigma of element 7 is 0 S"),
+    ],
+)
+def test_noise_and_sheets_that_cannot_be_are_refused(prepare, given, message, model):
+    given = {name: value(model) if callable(value) else value for name, value in given.items()}
+    with pytest.raises(InverseError, match=message):
+        prepare(model, **{"noise": np.full(550, STD)} | given)
+
+
 @pytest.mark.parametrize("batch", [(0,), (2, 0)])
 def test_a_batch_of_no_frames_holds_no_contacts(finder, batch):
     found = finder(np.zeros((*batch, 550)))

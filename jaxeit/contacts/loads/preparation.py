@@ -15,7 +15,7 @@ from ...model.discretisation import Model
 from ...model.forward_model import coefficients, conductivity, transfer
 from ...model.gaussian_field import field_modes
 from ..bump_responses import mean_conductivity, quadrature_points
-from ..preparation import sheet_and_readings
+from ..preparation import MIN_SIGNAL, require_signal, sheet_and_readings
 from .belief import LoadBelief
 from .fitter import LoadFitter
 from .pressure import LOAD_PARAMETERS, MAX_LOADS, Form
@@ -59,11 +59,13 @@ def prepare_loads(
     chart = np.asarray(model.chart, float)
     low, high = chart.min(0), chart.max(0)
     sheet = _sheet(model, settings, sigma, settings.coat_spread(known), put(found.factor), found.electrodes, gain)
+    starts = _starts(sheet, settings, low, high, mean_conductivity(model, np.asarray(sigma, float)))
+    require_signal(bool((np.linalg.norm(starts.atoms, axis=1) > MIN_SIGNAL).any()))
     return LoadFitter(
         belief=_belief(sheet, settings, low, high),
         whitening=found.whitening,
         compress=put(found.compress),
-        starts=_starts(sheet, settings, low, high, mean_conductivity(model, np.asarray(sigma, float))),
+        starts=starts,
     )
 
 
