@@ -14,6 +14,7 @@ from .._compile import full_precision, require_known, verb
 from ..imaging.inputs import InverseError, real_numbers
 from ..imaging.untouched import sheet_of
 from ..imaging.whitening import Whitened, whitened_readings
+from ..kinds import require_kind
 from ..model.bases import Elements
 from ..model.discretisation import Model, require_model
 from ..model.sensitivity import pair_jacobian
@@ -72,8 +73,11 @@ def prepare_contacts(
             no coating explains the untouched frame.
         SceneError: if ``model`` is no model, such as a skin.
     """
+    settings = ContactSettings() if settings is None else settings
+    require_kind(
+        settings, ContactSettings, InverseError, "settings of contacts", "ContactSettings(...)", "prepare_contacts"
+    )
     sigma, whitened = sheet_and_readings("prepare_contacts", model, noise, untouched, sigma, channels)
-    settings = settings or ContactSettings()
     nodes = table_nodes(model, settings.widths, settings.columns)
     slopes, background = _relative_jacobian(model, whitened, sigma)
     table = tabulate(model, slopes, nodes.subsample(3))

@@ -30,11 +30,18 @@ def known_flags(channels: Any, readings: int) -> np.ndarray:
 
 
 def as_flags(channels: Any, readings: int) -> Any:
-    """One flag per reading; of JAX where it traces them, else of NumPy."""
+    """One flag per reading; of JAX where it traces them, else of NumPy. Indices of readings are no flags."""
     require_unmasked({"channels": channels}, InverseError, "False")
-    flags = channels.astype(bool) if is_traced(channels) else np.asarray(channels, bool)
+    flags = channels if is_traced(channels) else _array_of(channels)
+    if flags.dtype != bool:
+        raise InverseError(
+            f"channels is {flags.dtype} of shape {flags.shape}; give booleans, one for each of {readings} readings: of "
+            f"indices np.isin(np.arange({readings}), channels), of zeros and ones channels.astype(bool)"
+        )
     if flags.shape != (readings,):
-        raise InverseError(f"channels has shape {flags.shape}; this model has {readings} readings")
+        raise InverseError(
+            f"channels has shape {flags.shape}; this model has {readings} readings: give a boolean for each"
+        )
     return flags
 
 

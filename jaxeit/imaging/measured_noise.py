@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
 from ..registry import Registry
-from .inputs import InverseError, require_real
+from .inputs import InverseError, known_flags, require_real
 from .noise import noise_covariance
 
 LEAST_DEVIATION = 0.1  # of the median deviation: a reading that hardly changes is not trusted more than tenfold
@@ -119,7 +119,7 @@ def _used(
         raise InverseError(f"{type(noise).__name__} is measured; give frames without contact (quiet=), or EqualNoise()")
     require_real(quiet=quiet)
     frames = np.asarray(quiet, float)
-    used = np.ones(frames.shape[1], bool) if channels is None else np.asarray(channels, bool)
+    used = np.ones(frames.shape[1], bool) if channels is None else known_flags(channels, frames.shape[1])
     frames = frames[:, used]
     frames = frames[np.isfinite(frames).all(1)]
     if len(frames) < 4:

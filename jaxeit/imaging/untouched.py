@@ -1,7 +1,6 @@
 """What is known of the sheet before a touch: its conductivity, or a frame of the untouched skin."""
 
 import jax.numpy as jnp
-import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
@@ -9,7 +8,7 @@ from ..kinds import stated
 from ..model.discretisation import Model
 from ..model.forward_model import CoatedSheet
 from . import absolute  # which is imported on first use, since its solvers take a tenth of a second
-from .inputs import InverseError, require_real
+from .inputs import InverseError, as_flags, require_real
 
 
 def sheet_of(
@@ -40,12 +39,11 @@ def untouched_frame(
     Raises:
         InverseError: if both a frame and a conductivity are given.
     """
+    flags = None if channels is None else as_flags(channels, model.readings)
     if untouched is None:
         return None
     if sigma is not None:
         raise InverseError("untouched and sigma both tell the sheet; give one of them")
     require_real(untouched=untouched)
     frame = jnp.asarray(untouched, model.dtype)
-    if channels is not None and frame.shape == np.shape(channels):
-        frame = jnp.where(jnp.asarray(channels, bool), frame, jnp.nan)
-    return frame
+    return frame if flags is None or frame.shape != flags.shape else jnp.where(flags, frame, jnp.nan)

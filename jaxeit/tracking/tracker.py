@@ -16,7 +16,7 @@ from .._compile import require_known
 from ..imaging.absolute.background import UntouchedSheet, fitted_sheet
 from ..imaging.inputs import InverseError, require_real
 from ..imaging.untouched import untouched_frame
-from ..kinds import require_unmasked
+from ..kinds import require_kind, require_unmasked
 from ..model.discretisation import Model, require_model
 from ..skin.description import Skin
 from .belief.consider import ConsiderErrors
@@ -381,9 +381,12 @@ def prepare_tracker(
     Raises:
         InverseError: as for `prepare_contacts`.
     """
+    settings = TrackerSettings() if settings is None else settings
+    require_kind(
+        settings, TrackerSettings, InverseError, "settings of a tracker", "TrackerSettings(...)", "prepare_tracker"
+    )
     require_model(model)
     require_known("prepare_tracker", InverseError, model, noise, untouched, sigma, channels)
-    settings = settings or TrackerSettings()
     frame = untouched_frame(model, untouched, sigma, channels)
     sheet = None if sigma is None else UntouchedSheet(sigma, np.zeros((len(sigma), 0)))
     sheet = sheet if frame is None else fitted_sheet(model, frame)

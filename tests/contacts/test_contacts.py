@@ -315,6 +315,13 @@ def test_noise_and_sheets_that_cannot_be_are_refused(prepare, given, message, mo
         prepare(model, **{"noise": np.full(550, STD)} | given)
 
 
+@pytest.mark.parametrize("prepare", PREPARED.values(), ids=PREPARED)
+@pytest.mark.parametrize("wrong", [je.load_skin("testbed"), 3, "fine", 0])
+def test_settings_of_another_kind_are_refused(prepare, wrong, model):
+    with pytest.raises(InverseError, match=r"is not settings of [a-z ]+; give \w+Settings\(\.\.\.\)"):
+        prepare(model, settings=wrong, noise=np.full(550, STD))
+
+
 @pytest.mark.parametrize("batch", [(0,), (2, 0)])
 def test_a_batch_of_no_frames_holds_no_contacts(finder, batch):
     found = finder(np.zeros((*batch, 550)))

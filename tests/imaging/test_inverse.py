@@ -213,6 +213,11 @@ def test_float32_images_follow_float64(skin, model, pixels, recon):
         ({"noise": np.zeros(550)}, "reading 0"),
         ({"channels": np.zeros(550, bool)}, "every channel"),
         ({"sigma": None, "channels": np.ones(2, bool)}, "550 readings"),
+        ({"channels": np.arange(550)}, r"channels is int64 of shape \(550,\); give booleans, one for each of 550"),
+        ({"channels": np.ones(550)}, r"channels is float64 .*, of zeros and ones channels.astype\(bool\)"),
+        ({"channels": [3, 4]}, r"of indices np.isin\(np.arange\(550\), channels\)"),
+        ({"channels": ["a"] * 550}, "give booleans"),
+        ({"untouched": np.ones(550), "channels": np.arange(550)}, "give booleans"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(model, pixels, settings, message):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxeit.imaging import CorrelatedNoise, MeasuredNoise, noise_covariance
+from jaxeit.imaging import CorrelatedNoise, InverseError, MeasuredNoise, noise_covariance
 
 
 @pytest.fixture(scope="module")
@@ -24,6 +24,12 @@ def test_a_channel_that_hardly_moves_has_a_tenth_of_the_median_in_both(quiet):
     scale, known = np.sqrt(np.diagonal(covariance)), noise_covariance(quiet)
     known /= np.sqrt(np.outer(np.diagonal(known), np.diagonal(known)))
     np.testing.assert_allclose(covariance / np.outer(scale, scale), known, rtol=1e-9)
+
+
+@pytest.mark.parametrize("noise", [MeasuredNoise(), CorrelatedNoise()])
+def test_indices_of_channels_are_no_flags(noise, quiet):
+    with pytest.raises(InverseError, match=r"channels is int64 of shape \(5,\); give booleans"):
+        noise.measured(quiet, np.arange(5))
 
 
 def test_other_channels_keep_their_covariance(quiet):

@@ -128,6 +128,8 @@ def test_leaving_out_nothing_or_everything(noisy):
         recon.without(np.ones(550, bool))
     with pytest.raises(je.imaging.InverseError, match="550 readings"):
         recon.without(np.ones(3, bool))
+    with pytest.raises(je.imaging.InverseError, match="channels is int64 of shape"):
+        recon.without(np.arange(550))
 
 
 def test_posterior_variance_is_that_of_the_formula(noisy):

@@ -11,6 +11,8 @@ from jaxtyping import Array, Bool, Float
 from scipy.spatial import cKDTree
 
 from ..._compile import full_precision, verb
+from ...imaging.inputs import InverseError
+from ...kinds import require_kind
 from ...model.discretisation import Model
 from ...model.forward_model import coefficients, conductivity, transfer
 from ...model.gaussian_field import field_modes
@@ -51,8 +53,9 @@ def prepare_loads(
     Raises:
         InverseError: as for `prepare_contacts`.
     """
+    settings = LoadSettings() if settings is None else settings
+    require_kind(settings, LoadSettings, InverseError, "settings of loads", "LoadSettings(...)", "prepare_loads")
     sigma, found = sheet_and_readings("prepare_loads", model, noise, untouched, sigma, channels)
-    settings = settings or LoadSettings()
     put = partial(jnp.asarray, dtype=model.dtype)
     known = sigma is not None
     sigma = conductivity(model) if sigma is None else put(sigma)
