@@ -9,6 +9,7 @@ import platform
 import re
 import shutil
 import socket
+import subprocess
 import sys
 import tempfile
 import time
@@ -57,7 +58,21 @@ def _guarded(check: Callable[[], Iterator[Line]]) -> list[Line]:
     try:
         return list(check())
     except Exception as error:  # a broken installation may raise any error
-        return [Line(name, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}", "install jaxeit again")]
+        text = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        return [Line(name, text, _unset(_named_in(str(error))) or "install jaxeit again")]
+
+
+def _named_in(text: str) -> list[str]:
+    """The variables of JAX and XLA that are set and that an error names."""
+    return [
+        name for name in sorted(os.environ) if name.startswith(("JAX_", "XLA_")) and re.search(rf"\b{name}\b", text)
+    ]
+
+
+def _unset(names: list[str]) -> str:
+    """What to do about these variables; empty: there are none."""
+    given = " and ".join(f"{name}={os.environ[name]}" for name in names)
+    return f"correct or unset {given}" if names else ""
 
 
 def _python() -> Iterator[Line]:
@@ -91,11 +106,29 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 
 def _device() -> Iterator[Line]:
+    refused = _refused_flags()
+    if refused:
+        yield Line("device", refused, _unset(["XLA_FLAGS"]))
+        return
     jax = importlib.import_module("jax")
     devices = ", ".join(f"{d.platform} ({d.device_kind})" for d in jax.devices())
     yield Line("device", f"JAX computes on {devices}")
     skin = importlib.import_module("jaxeit").load_skin("testbed")
     yield Line("skins", f"{skin.name} is readable, {skin.protocol.readings} readings")
+
+
+def _refused_flags() -> str:
+    """Why JAX does not begin with the XLA_FLAGS that are set; empty: it does. It ends a process that has wrong ones."""
+    if not os.environ.get("XLA_FLAGS"):
+        return ""
+    begin = [sys.executable, "-c", "import jax; jax.devices()"]
+    found = subprocess.run(
+        begin, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace", check=False
+    )
+    if "XLA_FLAGS" not in found.stderr or not found.returncode:
+        return ""  # what else is wrong, this process can say by itself
+    line = next(line for line in found.stderr.splitlines() if "XLA_FLAGS" in line)
+    return line.partition("] ")[2] or line
 
 
 def _threads() -> Iterator[Line]:

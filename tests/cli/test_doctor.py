@@ -1,8 +1,13 @@
 """The doctor: every line says ok or what to do."""
 
+import os
+import subprocess
+import sys
 import warnings
 from contextlib import nullcontext
 from types import SimpleNamespace
+
+import pytest
 
 from calib.cli import diagnosis as doctor, main
 from calib.cli.diagnosis import Line, examine
@@ -85,6 +90,38 @@ def test_a_cache_open_to_others(monkeypatch):
 def test_a_full_disk(monkeypatch):
     monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e6))
     assert not found("disk").ok
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("JAX_ENABLE_X64", "banana", "invalid truth value 'banana'"),
+        ("JAX_PLATFORMS", "tpu", "Unable to initialize backend 'tpu'"),
+        ("XLA_FLAGS", "--xla_banana=1", "Unknown flag"),
+    ],
+)
+def test_a_variable_with_which_jax_does_not_begin_is_named(name, value, said):
+    """The doctor says so, and goes on; XLA ends a process with flags that it does not know."""
+    environment = os.environ | {name: value}
+    command = [sys.executable, "-m", "calib.cli", "doctor"]
+    found = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert found.returncode == 2
+    line, remedy = found.stdout.partition("BAD   device: ")[2].splitlines()[:2]
+    assert said in line
+    assert remedy == f"      -> correct or unset {name}={value}"
+    assert "install jaxeit again" not in found.stdout
+    assert "ok    loopback: " in found.stdout
+
+
+def test_flags_of_xla_that_are_right_are_no_fault(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+    assert found("device").ok
+
+
+def test_without_flags_of_xla_no_process_is_started(monkeypatch):
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    monkeypatch.setattr(doctor.subprocess, "run", None)
+    assert found("device").ok
 
 
 def test_a_line_reads_well():
