@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import sys
 
 import numpy as np
@@ -21,7 +22,7 @@ PIXELS = ROWS * COLUMNS
 S = 10**9
 
 
-def force_map(path, times, seed=0, rows=ROWS, columns=COLUMNS, pads=PADS):
+def force_map(path, times, seed=0, rows=ROWS, columns=COLUMNS, pads=PADS, skin=""):
     """A force map file with frames at these times, ns, and what it holds."""
     rng = np.random.default_rng(seed)
     count = len(times)
@@ -35,6 +36,7 @@ def force_map(path, times, seed=0, rows=ROWS, columns=COLUMNS, pads=PADS):
         arrays["force"][2, :5] = np.nan
         arrays["pad_force"][2, 0] = np.nan
     attrs = {"image_rows": rows, "image_columns": columns, "time_epoch_utc": "2026-01-31T12:00:00Z"}
+    attrs |= {"skin": skin} if skin else {}
     with ArchiveWriter(path, "skin-forcemap", attrs) as writer:
         for name, values in arrays.items():
             writer.add(name, values, "1")
@@ -227,7 +229,8 @@ def test_what_cannot_be_exported_is_refused(sources, tmp_path, capsys, monkeypat
     refused(ExportError, "would repeat each force map .* times", tmp_path, paths, fps=1_000_000)
     refused(ExportError, "--full-scale", tmp_path, paths, full_scale=-1.0)
     force_map(tmp_path / "other.h5", [0, S], columns=5)
-    refused(ExportError, "other.h5: another skin than that of a.h5", tmp_path, [paths[0], tmp_path / "other.h5"])
+    named = f"{tmp_path}/other.h5: another skin than that of {tmp_path}/a.h5"
+    refused(ExportError, named, tmp_path, [paths[0], tmp_path / "other.h5"])
     force_map(tmp_path / "gaps.h5", [0, 1, 2, 10**6])
     refused(SessionError, "gaps.h5: time: .*long gaps", tmp_path, [tmp_path / "gaps.h5"])
     force_map(tmp_path / "back.h5", [0, 2, 1])
@@ -242,6 +245,15 @@ def test_what_cannot_be_exported_is_refused(sources, tmp_path, capsys, monkeypat
     assert main(["export", "lerobot", str(paths[0]), "-o", str(tmp_path / "set")]) == 2
     assert "pip install 'jaxeit[tables]'" in capsys.readouterr().err
     assert not [path for path in tmp_path.iterdir() if "set" in path.name]
+
+
+def test_force_maps_of_two_skins_are_told_apart_by_path_and_skin(tmp_path):
+    for folder, skin, columns in (("A", "chest", 4), ("B", "left arm", 5)):
+        (tmp_path / folder).mkdir()
+        force_map(tmp_path / folder / "fm.h5", [0, S], columns=columns, skin=skin)
+    first, second = (tmp_path / folder / "fm.h5" for folder in "AB")
+    said = f"{second}: another skin than that of {first} (left arm, image 3 x 5, 2 pads and chest, image 3 x 4, 2 pads)"
+    refused(ExportError, re.escape(said), tmp_path, [first, second])
 
 
 def test_one_frame_and_one_pad(tmp_path):

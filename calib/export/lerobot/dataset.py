@@ -102,13 +102,17 @@ def export_lerobot(
 
 
 class _Source(NamedTuple):
-    """What a force map says before its frames are read: rate of the frames (Hz), largest force on a pixel (N)."""
+    """What a force map says before its frames are read: rate of the frames (Hz), largest force on a pixel (N), name."""
 
     rows: int
     columns: int
     pads: tuple[str, ...]
     rate: float
     largest: float
+    skin: str
+
+    def __str__(self) -> str:
+        return f"{self.skin}, image {self.rows} x {self.columns}, {len(self.pads)} pads"
 
 
 def _require(sources: Sequence[object], output: Path, fps: int | None, full_scale: float | None) -> None:
@@ -134,7 +138,9 @@ def _skins_of(sources: list[Path]) -> list[_Source]:
     skins = [_skin_of(source) for source in sources]
     for source, skin in zip(sources, skins, strict=True):
         if skin[:3] != skins[0][:3]:
-            raise ExportError(f"{source.name}: another skin than that of {sources[0].name}; export it alone")
+            raise ExportError(
+                f"{source}: another skin than that of {sources[0]} ({skin} and {skins[0]}); export it alone"
+            )
     return skins
 
 
@@ -185,7 +191,7 @@ def _skin_of(path: Path) -> _Source:
         blocks = (archive.arrays["force"].read(at, at + BLOCK) for at in range(0, frames, BLOCK))
         largest = max(float(np.nanmax(block, initial=0.0)) for block in blocks)
         pads = tuple(str(name) for name in archive.arrays["pad_names"].read().tolist())
-        return _Source(rows, columns, pads, rate, largest)
+        return _Source(rows, columns, pads, rate, largest, str(archive.attrs.get("skin", "a skin without a name")))
 
 
 def _rate(path: Path, times: np.ndarray) -> float:
