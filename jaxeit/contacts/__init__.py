@@ -20,7 +20,7 @@ Example:
     dv = je.forward(model, model.background * (1 + 0.4 * bumps)) - v0
 
     finder = je.prepare_contacts(model, je.contacts.ContactSettings(most=2, columns=21), noise=noise)
-    found = finder(dv)  # under jit and vmap, too
+    found = finder(dv)  # or equinox.filter_jit(finder)(dv), or in a function under jax.jit or jax.vmap
     for place, width, present in zip(found.position, found.width, found.present, strict=True):
         if present:
             print(f"at {1e3 * place[0]:.1f}, {1e3 * place[1]:.1f} mm, {1e3 * width:.1f} mm wide")

@@ -87,7 +87,8 @@ class ContactFinder(eqx.Module):
     | most: contacts looked for, K                                              |              |       |
 
     Example:
-        # a step of a program of yours; jax.jit(finder) itself has arrays that JAX cannot hash
+        # a step of a program of yours; jax.jit(finder) itself has arrays that JAX cannot hash, which
+        # equinox.filter_jit(finder) takes
         strongest = jax.jit(lambda dv: finder(dv).amplitude.max())
         print(strongest(dv))  # S
         several = jax.vmap(finder)(jnp.stack([dv, 2 * dv]))  # frames along a leading axis

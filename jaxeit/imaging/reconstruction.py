@@ -177,7 +177,8 @@ class Reconstructor(AbstractReconstructor):
     | the rest: `AbstractReconstructor`                                                |            |      |
 
     A call is compiled already. As a step of a compiled function of your own it stands in that function, as below:
-    ``jax.jit(recon)`` itself has arrays that JAX cannot hash.
+    ``jax.jit(recon)`` itself has arrays that JAX cannot hash: write ``jax.jit(lambda dv: recon(dv))`` or
+    ``equinox.filter_jit(recon)``.
 
     Example:
         strongest = jax.jit(lambda dv: jnp.max(recon(dv)))

@@ -329,6 +329,14 @@ def test_a_batch_of_no_frames_holds_no_contacts(finder, batch):
     assert found.covariance.shape == (*batch, 2, 4, 4)
 
 
+def test_ways_to_compile_a_finder_that_the_docstrings_name(finder):
+    dv = STD * np.random.default_rng(2).normal(size=550) * 30
+    expected = finder(dv)
+    for compiled in (eqx.filter_jit(finder), jax.jit(lambda dv: finder(dv))):
+        for found, known in zip(jax.tree.leaves(compiled(dv)), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(np.asarray(found, float), np.asarray(known, float), rtol=1e-6, atol=1e-9)
+
+
 def test_frames_of_another_length_are_refused(finder):
     with pytest.raises(InverseError, match="550 readings"):
         finder(np.zeros(549))

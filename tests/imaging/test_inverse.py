@@ -1,5 +1,6 @@
 """Reconstruction: the two spaces agree, the limits hold, and bad settings are refused."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -239,6 +240,13 @@ def test_settings_that_cannot_be_are_refused(model, pixels, settings, message):
 def test_a_choice_in_the_place_of_another_is_refused(model, choices, message):
     with pytest.raises(je.imaging.InverseError, match=message):
         je.prepare(model, *choices)
+
+
+def test_ways_to_compile_a_reconstructor_that_its_docstring_names(recon, model):
+    dv = je.forward(model, _touch(model, (0.07, 0.12))) - je.forward(model)
+    expected = np.asarray(recon(dv))
+    for compiled in (eqx.filter_jit(recon), jax.jit(lambda dv: recon(dv))):
+        np.testing.assert_allclose(np.asarray(compiled(dv)), expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
 
 
 def test_imaging_refuses_a_method_for_a_prior():
