@@ -29,18 +29,19 @@ import jax
 
 import jaxeit as je
 
-from ..calibration.calibration import Calibration, load_calibration
+from ..calibration.archives.opening import load_calibration
+from ..calibration.calibration import Calibration
+from ..calibration.given import are_logs
+from ..calibration.logs.calibration import LogCalibration
 from ..calibration.procedure import calibrate
 from ..calibration.recipe import Recipe, recipe_or_default
 from ..report.document import write_report
 from ..report.figures.parts import require_matplotlib
-from ..report.log_document import write_log_report
 from ..runtime import settings, take_over
 from ..session import Session, SessionError, open_session
 from ..session.given import paths_of, require_skin_or_none
 from .digests import describe, digest
 from .locks import exclusive, lock_of, remove_unfinished
-from .logs import ensure_log_calibration
 from .workers import ONE_AT_A_TIME, end_workers, spawned_pool
 
 _DIED = "its worker process died, most likely for want of memory; try it alone, or on a machine with more"
@@ -104,7 +105,7 @@ def calibrate_many(
     Args:
         paths: paths of the session files.
         out: output folder, created if necessary; sessions that are done there already are skipped.
-        recipe, skin, ignore_errors: as for `calibrate`.
+        recipe, skin, ignore_errors: as for `calibrate`; the skin is that of the sessions with EIT.
         executor: default: a pool of spawned processes with one thread of computation each. Another example is
             `distributed.Client(address).get_executor(pure=False)`; its workers must see the same files.
         jobs: number of processes of the default pool; default: one per core.
@@ -115,7 +116,7 @@ def calibrate_many(
     After a first `KeyboardInterrupt` no other session begins, and it is raised again when those that run have ended; a
     second one ends the processes of the default pool at once. The same call goes on with what is not done.
 
-    A session without EIT is a log of force and pressure: it gets the calibration of a log, as by `jaxeit calibrate`.
+    A session without EIT is a log of force and pressure: it gets the calibration of a log, as by `calibrate`.
     The outcome of a session that fails names the reason, and the other sessions complete. The default pool also
     survives a session that kills its worker. Call this function below ``if __name__ == "__main__":``, because spawned
     processes import the main module.
@@ -323,30 +324,15 @@ def calibrate_one(task: _Task) -> Outcome:
 
 
 def _do_task(task: _Task) -> Outcome:
-    """Do a task and return its outcome; a session without EIT is a log."""
+    """Do a task and return its outcome."""
     with open_session(task.session) as session:
-        mark = digest(session.hash, task.mark)
-        if "eit" not in session.streams:
-            return _do_log(task, session, mark)
-        calibration, skipped = _ensure_calibration(task, session, mark)
+        calibration, skipped = _ensure_calibration(task, session, digest(session.hash, task.mark))
     skipped &= not _ensure_report(task, calibration)
     summary = calibration.evaluation.summary()
     return Outcome(task.session, task.calibration, "", skipped, calibration.simulated, summary=summary)
 
 
-def _do_log(task: _Task, session: Session, mark: str) -> Outcome:
-    _, recipe, ignore_errors = pickle.loads(task.choices)
-    found, skipped = ensure_log_calibration(task.calibration, session, recipe, mark, ignore_errors)
-    if not skipped:
-        _page_of(task).unlink(missing_ok=True)  # of an earlier calibration
-    if task.report and not _page_of(task).exists():
-        write_log_report(found, _page_of(task))
-        skipped = False
-    summary = found.evaluation.summary()
-    return Outcome(task.session, task.calibration, "", skipped, found.simulated, summary=summary)
-
-
-def _ensure_calibration(task: _Task, session: Session, mark: str) -> tuple[Calibration, bool]:
+def _ensure_calibration(task: _Task, session: Session, mark: str) -> tuple[Calibration | LogCalibration, bool]:
     """The calibration of a task, and whether it existed already."""
     with contextlib.suppress(SessionError):
         found = load_calibration(task.calibration)
@@ -354,13 +340,14 @@ def _ensure_calibration(task: _Task, session: Session, mark: str) -> tuple[Calib
             return found, True
     _page_of(task).unlink(missing_ok=True)  # of an earlier calibration
     skin, recipe, ignore_errors = pickle.loads(task.choices)
-    made = calibrate([session], skin, recipe=recipe, ignore_errors=ignore_errors)
+    own = None if are_logs([session], "calibrate") else skin
+    made: Calibration | LogCalibration = calibrate([session], own, recipe=recipe, ignore_errors=ignore_errors)
     made = replace(made, provenance=made.provenance | {"batch": mark})
     made.save(task.calibration)
     return made, False
 
 
-def _ensure_report(task: _Task, calibration: Calibration) -> bool:
+def _ensure_report(task: _Task, calibration: Calibration | LogCalibration) -> bool:
     """Write the report unless it exists; returns whether it was written. The page is the last of its files."""
     if not task.report or _page_of(task).exists():
         return False

@@ -1,7 +1,7 @@
 """Force maps in newtons: from changes of frames and pressures, by the parts of a calibration."""
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import equinox as eqx
 import jax
@@ -15,11 +15,14 @@ import jaxeit as je
 from ..fitting.curves.samples import bucket
 from ..fitting.fields import Places
 from ..fitting.fields.places import nowhere
+from ..fitting.logs import LogPrediction
 from ..fitting.pad_gains import PadGains
 from ..fitting.pads import PadModel
+from ..session import SessionError
 from .calibration import Calibration, real_rows
-from .given import require_calibration
+from .given import require_calibration, require_no_eit_choices
 from .localisation.locators import AbstractLocator, locate
+from .logs.calibration import LogCalibration
 
 USED_PARTS = ("/device", "/streams/eit", "/streams/pressure")  # parts of a session from which forces are computed
 
@@ -80,33 +83,70 @@ def force_model(calibration: Calibration) -> ForceModel:
     return ForceModel(c.recon, c.masks, c.pads, c.locator)
 
 
+@overload
 def force_map(
     calibration: Calibration,
     frames: ArrayLike,
     pressures: ArrayLike,
+    place: None = None,
     *,
     gate: float = je.fusion.USUAL_GATE,
     before: np.ndarray | None = None,
-) -> ForceEstimate:
+) -> ForceEstimate: ...
+
+
+@overload
+def force_map(
+    calibration: LogCalibration, time: ArrayLike, values: ArrayLike, /, place: ArrayLike | None = None
+) -> LogPrediction: ...
+
+
+def force_map(
+    calibration: Calibration | LogCalibration,
+    frames: ArrayLike,
+    pressures: ArrayLike,
+    place: ArrayLike | None = None,
+    *,
+    gate: float = je.fusion.USUAL_GATE,
+    before: np.ndarray | None = None,
+) -> ForceEstimate | LogPrediction:
     """Force maps from changes of frames and pad pressures against the skin without contact.
+
+    By the calibration of a log, the force over time, which has no map: ``force_map(calibration, time, values)`` is
+    ``calibration.predict(time, values)``, with times (n,) ns and all channels as they were recorded, (n, columns).
 
     Args:
         frames: change of the readings, (n, readings) V.
         pressures: change of the readings of the pads at the same times, (n, pads) Pa.
+        place: of the contact (n, 2) m, only for the calibration of a log that `needs_place`.
         gate: as in `jaxeit.fuse`.
         before: the pads' own pressures that came earlier, (m, pads) Pa, for curves with memory; see `remembered`.
 
     Raises:
         ValueError: if the shapes do not fit the calibration, or values are not real numbers.
         FusionError: if the gate is no number from 0 to 1.
+        SessionError: for what is no calibration; a place for the calibration of a skin; for that of a log a gate or
+            earlier pressures, and as `LogCalibration.predict`.
     """
-    require_calibration(calibration, "force_map", "give calibration.predict(time, values)")
+    if isinstance(calibration, LogCalibration):
+        require_no_eit_choices("force_map", gate=None if gate == je.fusion.USUAL_GATE else gate, before=before)
+        return calibration.predict(frames, pressures, place)
+    require_calibration(calibration, "force_map")
+    if place is not None:
+        raise SessionError("force_map: the place of contact is that of the frames; leave out place")
+    return _force_map(calibration, frames, pressures, gate, before)
+
+
+def _force_map(
+    calibration: Calibration, frames: ArrayLike, pressures: ArrayLike, gate: float, before: np.ndarray | None
+) -> ForceEstimate:
+    """`force_map` for the calibration of a skin."""
     je.fusion.require_gate(gate)
     if before is not None:
         before = calibration.pad_rows(before, "before")
     frames, pressures = _changes(calibration, frames, pressures)
     if not len(frames):  # programs are of one row at least
-        row = force_map(calibration, np.zeros((1, frames.shape[1])), np.zeros((1, pressures.shape[1])), gate=gate)
+        row = _force_map(calibration, np.zeros((1, frames.shape[1])), np.zeros((1, pressures.shape[1])), gate, None)
         return first_rows(row, 0)
     model = force_model(calibration)
     pressures = jnp.asarray(pressures, model.pads.dtype)

@@ -1,11 +1,12 @@
 """What a function is given in the place of the calibration of a skin, refused with the call to make."""
 
+from collections.abc import Sequence
 from typing import Any
 
 from jaxeit.kinds import require_kind
 from jaxeit.model import require_dtype
 
-from ..session import SessionError
+from ..session import Session, SessionError
 from ..session.given import call_on
 from .calibration import Calibration
 from .logs.calibration import LogCalibration
@@ -28,12 +29,33 @@ def require_calibration(calibration: Any, call: str, for_logs: str = "give that 
     require_dtype(calibration.dtype, f"{call}: the calibration is of float64")
 
 
-def require_no_eit_choices(call: str, **choices: object) -> None:
-    """Refuse choices about EIT for the calibration of a log.
+def require_no_eit_choices(call: str, why: str = "the calibration is of a log", /, **choices: object) -> None:
+    """Refuse choices about EIT for a log or its calibration.
+
+    Args:
+        why: why there is no EIT, in words.
 
     Raises:
         SessionError: naming the call and the first choice that is neither None nor False.
     """
     for name, value in choices.items():
         if value is not None and value is not False:
-            raise SessionError(f"{call}: {name} is about EIT, and the calibration is of a log; leave out {name}")
+            raise SessionError(f"{call}: {name} is about EIT, and {why}; leave out {name}")
+
+
+def are_logs(sessions: Sequence[Session], call: str) -> bool:
+    """Whether sessions are logs, which hold no EIT.
+
+    Raises:
+        SessionError: there is no session, or some hold EIT and others none.
+    """
+    if not sessions:
+        raise SessionError(f"{call}: no session given; give one or more session files")
+    without = [session for session in sessions if "eit" not in session.streams]
+    if without and len(without) < len(sessions):
+        other = next(session for session in sessions if "eit" in session.streams)
+        raise SessionError(
+            f"{without[0].name}: /streams/eit: missing, as in a log, while {other.name} holds EIT; {call} logs and "
+            "sessions of a skin apart"
+        )
+    return bool(without)

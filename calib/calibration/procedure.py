@@ -33,7 +33,7 @@ from .archives.storage import describe
 from .calibration import Calibration
 from .evaluation import Evaluation, centre_of
 from .fitted_sessions import FITTED_NOTE, holds_presses, is_fitted, require_each_once
-from .given import require_calibration, require_no_eit_choices
+from .given import are_logs, require_calibration, require_no_eit_choices
 from .hysteresis_loops import typical_loops
 from .layer import learn_layer
 from .localisation.electrode_places import PlacedElectrodes, place_electrodes
@@ -42,7 +42,7 @@ from .localisation.place_doubts import correction_that_harms, no_better_than_a_g
 from .localisation.press_images import Imager, PressImages, prepare_imager
 from .logs.calibration import LogCalibration
 from .logs.evaluation import LogEvaluation
-from .logs.procedure import evaluate_log
+from .logs.procedure import calibrate_logs, evaluate_log
 from .own_classes import import_note
 from .press_examples import press_examples, press_probes
 from .recalibration.agreement import agreement_of_presses
@@ -51,6 +51,29 @@ from .recipe import Recipe, recipe_or_default
 STAGES = ("reading", "model and images", "fitting", "holding out")
 # Further stages, if the recipe asks for them.
 PLACING, LEARNING = "placing the electrodes", "learning the contact layer"
+FITTING_LOGS = "fitting the logs"  # the only stage of logs
+
+
+@overload
+def calibrate(
+    sessions: Session | Iterable[Session],
+    skin: je.Skin,
+    *,
+    recipe: Recipe | None = None,
+    ignore_errors: bool = False,
+    progress: Callable[[str], object] = ...,
+) -> Calibration: ...
+
+
+@overload
+def calibrate(
+    sessions: Session | Iterable[Session],
+    skin: None = None,
+    *,
+    recipe: Recipe | None = None,
+    ignore_errors: bool = False,
+    progress: Callable[[str], object] = ...,
+) -> Calibration | LogCalibration: ...
 
 
 def calibrate(
@@ -60,31 +83,48 @@ def calibrate(
     recipe: Recipe | None = None,
     ignore_errors: bool = False,
     progress: Callable[[str], object] = lambda stage: None,
-) -> Calibration:
+) -> Calibration | LogCalibration:
     """Fit one pressure-force curve per pad, and a correction by location, and prepare the image reconstruction.
 
+    Of logs, which are sessions without EIT, fit the channels of one sensor to the force, as
+    `calib.calibration.calibrate_logs` does.
+
     Args:
-        sessions: recorded on one skin, from `open_session`; one, or several. For sessions without EIT see
-            `calib.calibration.calibrate_logs`.
-        skin: default: the one described in the first session.
+        sessions: recorded on one skin, from `open_session`; one, or several. Or logs of one sensor.
+        skin: default: the one described in the first session. Logs have none.
         recipe: all choices of the procedure; default: those of the paper.
         ignore_errors: calibrate also from sessions in which `check_session` finds an error; the errors are then kept in
             the calibration's notes and provenance.
-        progress: called with the name of each of the `STAGES`, `PLACING` or `LEARNING`, when the stage begins.
+        progress: called with the name of each of the `STAGES`, `PLACING` or `LEARNING`, when the stage begins; of logs
+            with `FITTING_LOGS`.
 
     Raises:
-        SessionError: a session cannot be used, is given twice, or was recorded on another skin.
+        SessionError: a session cannot be used, is given twice, or was recorded on another skin or with another sensor;
+            some sessions hold EIT and others none; or a skin is given for logs.
         RecordingError: `check_session` finds an error in a session.
         FitError: a pad was not pressed enough to fit its curve, there are too few presses for a field, or a class of
             your own returns what cannot be, such as places off the sheet.
         InverseError, HyperparameterError: no image can be made as the recipe asks.
     """
     sessions = sessions_of(sessions, "calibrate")
-    _require_eit(sessions)
-    require_each_once(sessions)
     require_skin_or_none(skin, "calibrate")
     recipe = recipe_or_default(recipe, "calibrate")
-    skin = skin or _one_skin(sessions)
+    if are_logs(sessions, "calibrate"):
+        require_no_eit_choices("calibrate", "the sessions are logs", skin=skin)
+        progress(FITTING_LOGS)
+        return calibrate_logs(sessions, recipe, ignore_errors=ignore_errors)
+    return _calibrate_skin(sessions, skin or _one_skin(sessions), recipe, ignore_errors, progress)
+
+
+def _calibrate_skin(
+    sessions: Sequence[Session],
+    skin: je.Skin,
+    recipe: Recipe,
+    ignore_errors: bool,
+    progress: Callable[[str], object],
+) -> Calibration:
+    """`calibrate` for sessions with EIT."""
+    require_each_once(sessions)
     progress("reading")
     presses = pool_presses(sessions, skin, recipe.processing)
     accepted = accept(sessions, skin, ignore_errors=ignore_errors)
@@ -97,17 +137,6 @@ def calibrate(
         for session in sessions:
             calibration = learn_layer(calibration, session, ignore_errors=ignore_errors)
     return calibration
-
-
-def _require_eit(sessions: Sequence[Session]) -> None:
-    """Refuse no session at all, and sessions all of which are logs."""
-    if not sessions:
-        raise SessionError("calibrate: no session given; give one or more session files")
-    if all("eit" not in session.streams for session in sessions):
-        raise SessionError(
-            f"{sessions[0].name}: /streams/eit: missing, as in a log; calibrate logs by "
-            "calib.calibration.calibrate_logs(sessions)"
-        )
 
 
 def _one_skin(sessions: Sequence[Session]) -> je.Skin:

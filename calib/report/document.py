@@ -4,29 +4,43 @@ from collections.abc import Iterable, Mapping
 from html import escape
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any, overload
 
 import numpy as np
 
 import jaxeit as je
+from jaxeit.kinds import require_kind
 
 from ..calibration.calibration import Calibration
 from ..calibration.evaluation import FORCE_METHODS, FORCE_THIRDS, Evaluation, localisation_errors
 from ..calibration.given import require_calibration
+from ..calibration.logs.calibration import LogCalibration
+from ..calibration.logs.evaluation import LogEvaluation
 from ..fitting.cross_validation.selection import Candidate
-from ..session import replacing
+from ..session import SessionError, replacing
 from .figures.parts import require_matplotlib
 from .figures.presses import ESTIMATOR_MEANING
 from .html_parts import PAGE, PLUS_MINUS, STYLE, html_table, number_text, significant_text, with_error
+from .log_document import write_log_report
 from .pictures import Picture, calibration_pictures
 
-_NO_EVALUATIONS: Mapping[str, Evaluation] = MappingProxyType({})
+_NONE: Mapping[str, Any] = MappingProxyType({})
+
+
+@overload
+def write_report(
+    calibration: Calibration, path: str | Path, *, evaluations: Mapping[str, Evaluation] = _NONE
+) -> list[Path]: ...
+
+
+@overload
+def write_report(
+    calibration: LogCalibration, path: str | Path, *, evaluations: Mapping[str, LogEvaluation] = _NONE
+) -> list[Path]: ...
 
 
 def write_report(
-    calibration: Calibration,
-    path: str | Path,
-    *,
-    evaluations: Mapping[str, Evaluation] = _NO_EVALUATIONS,
+    calibration: Calibration | LogCalibration, path: str | Path, *, evaluations: Mapping[str, Any] = _NONE
 ) -> list[Path]:
     """Write the page and, beside it, its figures as PNG; each file whole or not at all.
 
@@ -34,23 +48,27 @@ def write_report(
         calibration: what the page is about.
         path: of the page; for ``report.html`` the figures are ``report_maps.png``, ``report_localisation.png``,
             ``report_sensitivity.png`` and ``report_curves.png``, of presses that were released also
-            ``report_loops.png``, with a correction by location ``report_gain.png``.
-        evaluations: of the calibration on other sessions, by name.
+            ``report_loops.png``, with a correction by location ``report_gain.png``. The page of a log
+            holds its figures.
+        evaluations: of the calibration on other sessions, by name, as `calib.evaluate` returns them.
 
     Returns:
         The paths written, the page first.
 
     Raises:
         ReportError: matplotlib is not installed.
-        SessionError: for a path or the calibration of a log in the place of the calibration.
+        SessionError: for a path in the place of the calibration, or an evaluation of a calibration of another kind.
         SessionError, OSError: a file cannot be written.
 
     Example:
         for path in calib.write_report(calibration, "report.html"):
             print(path)  # the page, and its figures as PNG
     """
-    for_logs = "write its page by calib.report.log_document.write_log_report"
-    require_calibration(calibration, "write_report", for_logs)
+    if isinstance(calibration, LogCalibration):
+        _require_evaluations(evaluations, LogEvaluation, "a log")
+        return [write_log_report(calibration, path, evaluations=evaluations)]
+    require_calibration(calibration, "write_report")
+    _require_evaluations(evaluations, Evaluation, "a skin")
     require_matplotlib()
     page = Path(path)
     pictures = calibration_pictures(calibration, evaluations)
@@ -60,6 +78,15 @@ def write_report(
         _write(target, picture.data)
     _write(page, text.encode())
     return [page, *files]
+
+
+def _require_evaluations(evaluations: Mapping[str, Any], kind: type, of: str) -> None:
+    """Refuse evaluations of a calibration of another kind."""
+    for name, found in evaluations.items():
+        give = "calib.evaluate(calibration, session)"
+        require_kind(
+            found, kind, SessionError, f"an evaluation of the calibration of {of}", give, f"evaluations: {name}"
+        )
 
 
 def _write(path: Path, data: bytes) -> None:

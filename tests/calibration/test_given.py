@@ -118,6 +118,14 @@ def test_what_is_no_change_of_frames_and_pads_is_named(calibration):
             of(np.ones(3))
 
 
+def test_what_only_logs_have_is_refused_for_a_skin(calibration, tmp_path):
+    frames, pads = np.zeros((1, calibration.recon.readings)), np.zeros((1, 4))
+    with pytest.raises(SessionError, match="force_map: the place of contact is that of the frames; leave out place"):
+        calib.force_map(calibration, frames, pads, np.zeros((1, 2)))
+    with pytest.raises(SessionError, match=r"evaluations: b\.h5: Calibration is not an evaluation of .* a skin; give"):
+        calib.write_report(calibration, tmp_path / "r.html", evaluations={"b.h5": calibration})
+
+
 def test_pressures_of_one_time_are_one_row(calibration):
     force, error, valid = calibration.pad_forces(np.full(4, 500.0))
     assert force.shape == error.shape == valid.shape == (1, 4)

@@ -375,11 +375,6 @@ def _force_arrays(time: np.ndarray, epoch: str, found: LogPrediction) -> Mapping
     }
 
 
-def with_batch_mark(calibration: LogCalibration, mark: str) -> LogCalibration:
-    """The calibration with the mark of a batch in its provenance."""
-    return replace(calibration, provenance=calibration.provenance | {"batch": mark})
-
-
 def render_log(name: str, calibration: LogCalibration) -> str:
     """The calibration as lines for a terminal."""
     fitted = calibration.model.curve

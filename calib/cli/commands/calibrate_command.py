@@ -4,8 +4,8 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,12 +14,11 @@ from ...calibration.recipe_text import NONE, SWITCHES
 from ...session import Session
 from ..arguments import count, prepare_results, require_matplotlib_for, skin_of
 from ..recipe_options import IMAGING, add_recipe_arguments, recipe_of
+from ..results import render_calibration, render_found
 from ..terminal import announce_model, say_interrupted, show, stage_bar, title
 
 if TYPE_CHECKING:
-    from ...calibration import Calibration
-    from ...calibration.evaluation import Evaluation
-    from ...calibration.logs.evaluation import LogEvaluation
+    from jaxeit.skin import Skin
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,23 +57,22 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _calibrate_together(args: argparse.Namespace) -> int:
-    from jaxeit.skin import parse_skin
-
-    from ...calibration.evaluation import render_table
-    from ...calibration.procedure import STAGES, calibrate, evaluate
+    from ...calibration.given import are_logs
+    from ...calibration.procedure import calibrate, evaluate
     from ...session import open_session
 
     prepare_results(args, "output", "report")
     recipe, skin = recipe_of(args), skin_of(args.skin)
     with ExitStack() as stack:
         sessions = [stack.enter_context(open_session(path)) for path in args.sessions]
-        if all("eit" not in session.streams for session in sessions):
-            return _calibrate_logs(args, recipe, sessions)
-        announce_model(skin or parse_skin(sessions[0].skin_toml, f"{sessions[0].name}: skin_toml"), recipe.fidelity)
-        stages = stack.enter_context(stage_bar(len(STAGES) + recipe.fit_electrodes + recipe.learn_layer))
+        if are_logs(sessions, "calibrate"):
+            _refuse_eit_options(args)
+            stages = stack.enter_context(stage_bar(1))
+        else:
+            stages = stack.enter_context(_skin_stages(sessions, skin, recipe))
         calibration = calibrate(sessions, skin, recipe=recipe, ignore_errors=args.force, progress=stages)
         tests = {Path(path).name: stack.enter_context(open_session(path)) for path in args.test}
-        tried = {name: evaluate(calibration, s, ignore_errors=args.force) for name, s in tests.items()}
+        tried: dict[str, Any] = {name: evaluate(calibration, s, ignore_errors=args.force) for name, s in tests.items()}
     calibration.save(args.output)
     if args.report:
         from ...report.document import write_report
@@ -82,40 +80,40 @@ def _calibrate_together(args: argparse.Namespace) -> int:
         write_report(calibration, Path(args.report), evaluations=tried)
     if args.json:
         own = calibration.evaluation.summary() | {"notes": list(calibration.notes)}
-        _print_json(own, tried)
+        results = {"calibration": own} | {name: found.summary() for name, found in tried.items()}
+        print(json.dumps(results, indent=2, sort_keys=True))
         return 0
-    show(_rendered(calibration, title(_names(args), calibration.simulated)))
+    show(render_calibration(calibration, title(_names(args), calibration.simulated)))
     for name, found in tried.items():
-        show("\n" + render_table(found, title(name, tests[name].simulated)))
-    _print_written(args)
+        show("\n" + render_found(found, title(name, tests[name].simulated)))
+    show(f"\nwrote {args.output}" + (f" and {args.report}" if args.report else ""))
     return 0
 
 
-def _rendered(calibration: "Calibration", heading: str) -> str:
-    """What a calibration attains, and what is to be known of it."""
-    from ...calibration.evaluation import render_table
-    from ...calibration.layer import render_layer
+def _skin_stages(
+    sessions: Sequence[Session], skin: "Skin | None", recipe: Recipe
+) -> AbstractContextManager[Callable[[str], None]]:
+    """The progress bar of a calibration of a skin, whose model is announced."""
+    from jaxeit.skin import parse_skin
 
-    lines = [render_table(calibration.evaluation, heading), *(f"  note: {note}" for note in calibration.notes)]
-    if calibration.layer is not None:
-        lines.append(f"  {render_layer(calibration.layer, calibration.recon)}")
-    if calibration.contact_law is not None:
-        lines.append(f"  force without pads: {calibration.contact_law.render()}")
-    return "\n".join(lines)
+    from ...calibration.procedure import STAGES
+
+    announce_model(skin or parse_skin(sessions[0].skin_toml, f"{sessions[0].name}: skin_toml"), recipe.fidelity)
+    return stage_bar(len(STAGES) + recipe.fit_electrodes + recipe.learn_layer)
 
 
-def _print_json(own: dict[str, Any], tried: "Mapping[str, Evaluation | LogEvaluation]") -> None:
-    """Print the figures of a calibration and those of the test sessions."""
-    results = {"calibration": own} | {name: found.summary() for name, found in tried.items()}
-    print(json.dumps(results, indent=2, sort_keys=True))
+_NEED_EIT = ("skin", "locator", "folds", "fidelity", "baseline", "correction", "low_pass", *SWITCHES, *IMAGING)
+
+
+def _refuse_eit_options(args: argparse.Namespace) -> None:
+    """Refuse options about EIT for logs."""
+    given = ["--" + name.replace("_", "-") for name in _NEED_EIT if getattr(args, name) not in (None, False, NONE)]
+    if given:
+        raise ValueError(f"{', '.join(given)}: for sessions with EIT, and these hold none; leave it out")
 
 
 def _names(args: argparse.Namespace) -> str:
     return ", ".join(Path(path).name for path in args.sessions)
-
-
-def _print_written(args: argparse.Namespace) -> None:
-    show(f"\nwrote {args.output}" + (f" and {args.report}" if args.report else ""))
 
 
 def _calibrate_many(args: argparse.Namespace) -> int:
@@ -173,36 +171,3 @@ def _refuse_single(args: argparse.Namespace) -> None:
         raise ValueError("--test is for one calibration; try those of a folder with jaxeit evaluate")
     if args.report:
         raise ValueError(f"--report {args.report}: every session gets a page of its own; give --report without a name")
-
-
-_NEED_EIT = ("skin", "locator", "folds", "fidelity", "baseline", "correction", "low_pass", *SWITCHES, *IMAGING)
-
-
-def _calibrate_logs(args: argparse.Namespace, recipe: Recipe, sessions: Sequence[Session]) -> int:
-    """Fit one model to sessions without EIT; it is evaluated on their second halves and on the test sessions."""
-    from ...calibration.logs.evaluation import render_evaluation
-    from ...calibration.logs.procedure import calibrate_logs, evaluate_log, render_log
-    from ...session import open_session
-
-    given = ["--" + name.replace("_", "-") for name in _NEED_EIT if getattr(args, name) not in (None, False, NONE)]
-    if given:
-        raise ValueError(f"{', '.join(given)}: for sessions with EIT, and these hold none; leave it out")
-    calibration = calibrate_logs(sessions, recipe, ignore_errors=args.force)
-    tried = {}
-    for path in args.test:
-        with open_session(path) as session:
-            tried[Path(path).name] = evaluate_log(calibration, session, ignore_errors=args.force)
-    calibration.save(args.output)
-    if args.report:
-        from ...report.log_document import write_log_report
-
-        write_log_report(calibration, Path(args.report), evaluations=tried)
-    if args.json:
-        _print_json(calibration.evaluation.summary(), tried)
-        return 0
-    show(render_log(title(_names(args), calibration.simulated), calibration))
-    show("\n" + render_evaluation(calibration.evaluation))
-    for name, found in tried.items():
-        show("\n" + render_evaluation(found, name))
-    _print_written(args)
-    return 0
