@@ -21,6 +21,9 @@ from ..fields import AbstractField, FittedField, Geometry, fit_field, log_gain, 
 LOADED_FRACTION = 0.1
 # Largest distance of two presses at one place, over the diagonal of the box of all presses.
 MERGE_DISTANCE = 0.03
+# m; presses nearer to each other are at one place in any case. Stages and robot arms that stand still say places that
+# differ by some micrometres, and repeat a place to some tens of them.
+REPEATABILITY = 5e-5
 MIN_PLACES = 8
 """Places of contact without which a log determines no field."""
 # Part of the box of the presses by which a place may lie outside it; as for the range of a channel.
@@ -89,13 +92,13 @@ def loaded_rows(place: Float[np.ndarray, "n 2"], force: Float[np.ndarray, " n"])
 def cluster_sites(place: Float[np.ndarray, "n 2"], force: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
     """Number (n,) of the place of contact of each sample, in random order.
 
-    Presses nearer to each other than `MERGE_DISTANCE` are at one place. A sample without contact has the number of the
-    press before.
+    Presses nearer to each other than `MERGE_DISTANCE` or `REPEATABILITY` are at one place. A sample without contact has
+    the number of the press before.
     """
     rows = np.flatnonzero(loaded_rows(place, force))
     if not len(rows):
         return np.zeros(len(force), int)
-    near = MERGE_DISTANCE * float(np.linalg.norm(np.ptp(place[rows], axis=0)))
+    near = max(MERGE_DISTANCE * float(np.linalg.norm(np.ptp(place[rows], axis=0))), REPEATABILITY)
     first = np.empty((0, 2))
     number = np.full(len(force), -1)
     for row in rows:

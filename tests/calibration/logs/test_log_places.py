@@ -137,6 +137,15 @@ def test_too_few_places_and_walls_that_a_log_does_not_have(tmp_path):
         calibrated(few, calib.Recipe(curve=Affine(), location=PadEdge()))
 
 
+def test_a_stage_that_stands_still_tells_one_place():
+    """Stages at rest say numbers that differ in their last digits, of which no field of gain is made."""
+    rng = np.random.default_rng(0)
+    still = np.array([0.315, -0.1]) + rng.normal(0, 5e-6, (500, 2))
+    assert len(np.unique(cluster_sites(still, np.full(500, 5.0)))) == 1
+    small = grid() / 30  # a pad of 1 mm, pressed at 49 places 0.17 mm apart
+    assert len(np.unique(cluster_sites(small, np.full(49, 5.0)))) == 49
+
+
 def test_presses_at_one_place_are_told_from_those_at_others():
     place = np.array([[0, 0], [1, 0], [1, 0.001], [0.5, 0.5], [0, 1], [0, 0.01]]) * SIDE
     force = np.array([5.0, 5.0, 5.0, 0.01, 5.0, 5.0])
