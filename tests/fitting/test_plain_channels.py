@@ -8,6 +8,7 @@ from scipy import ndimage
 
 import calib
 from benchmarks import bench_real
+from calib.calibration.logs.evaluation import LogEvaluation
 from calib.fitting import AffinePlay, PlaySpline
 from calib.fitting.curves import Affine, fit_curves
 from calib.fitting.curves.fitted import predict_pads
@@ -42,6 +43,34 @@ def test_recordings_that_are_not_there_are_named(tmp_path, capsys):
     with pytest.raises(SystemExit):
         bench_real.main([str(tmp_path)])
     assert f"{tmp_path} has no folder insole_plenum, pneumatic_actuator" in capsys.readouterr().err
+
+
+def test_chance_allows_what_so_few_independent_parts_scatter():
+    """Against draws: ten parts that an exact interval covers whole or not at all."""
+    drawn = (np.random.default_rng(0).random((20_000, 10)) < 0.9).mean(1)
+    least, most = bench_real.chance_band(10)
+    assert (least, most) == (0.7, 1.0)
+    assert np.mean(drawn < least) < 0.05 < np.mean(drawn < least + 0.1)
+    assert bench_real.chance_band(0) == (0.0, 1.0)
+    assert bench_real.effective_count(np.repeat(np.arange(10), 7)) == 10
+    assert bench_real.effective_count(np.repeat([0, 1, 2], [50, 50, 1])) == 2
+    sizes = np.array([60, 20, 20])  # the mean of unequal parts scatters as that of so many equal ones
+    means = (np.random.default_rng(1).normal(0, 1, (20_000, 3)) * sizes).sum(1) / 100
+    assert bench_real.effective_count(np.repeat([0, 1, 2], sizes)) == round(1 / means.var())
+
+
+def test_a_third_of_the_force_is_beyond_chance_or_not():
+    """Five rises and falls, whose large forces no interval holds; the others lie in all of theirs."""
+    time = np.arange(1000) / 10
+    force = 5 * (1 - np.cos(2 * np.pi * time / 20))
+    low = np.where(force > 20 / 3, force + 1, force - 1)
+    one = np.ones(1000)
+    found = LogEvaluation("", time, force, force, one, low, force + 2, one > 0)
+    rows = {row["third"]: row for row in bench_real.chance_rows(found)}
+    assert [row["coverage"] for row in rows.values()] == [1, 1, 0]
+    assert [row["beyond"] for row in rows.values()] == ["no", "no", "by blocks and cycles"]
+    assert {row["cycles"] for row in rows.values()} == {5}
+    assert all(5 < row["blocks"] <= 20 for row in rows.values())
 
 
 def test_a_lag_follows_a_step_by_its_time_constant():
