@@ -30,7 +30,7 @@ import numpy as np
 
 import jaxeit as je
 from calib.calibration.localisation.contact_tracks import ContactTracks
-from calib.calibration.localisation.law_lessons import LawLessons
+from calib.calibration.localisation.law_lessons import ContactLawLearner
 from jaxeit.tracking import ContactLaw, LearnedLayer, Track, Tracker, Tracking, fit_model_error, prepare_tracker
 
 from .force_ways import HELD, LIFTED, PAD_ERROR, SECONDS
@@ -127,7 +127,7 @@ class Session:
 
     def taught(self, stages: tuple[int, ...]) -> Iterator[tuple[int, LearnedLayer, ContactLaw]]:
         """Gain and law after some presses, which follow one another in one session."""
-        lessons = LawLessons(self.tracker, None, None)
+        lessons = ContactLawLearner(self.tracker, None, None)
         tracks, level = ContactTracks(self.tracker, smooth=False, watch=lessons), np.repeat([1.0, 0.0], [HELD, LIFTED])
         for number in range(max(stages) + 1):
             if number in stages:

@@ -43,7 +43,7 @@ FIRST_SEED = 5200
 PRESSES = 120  # of ordinary use
 AGED, WINDOWS = 48, 6  # presses and parts of the hour of a skin that ages
 TAUGHT = {"never taught": 0.0, "taught for 20 minutes": 1 / 3, "always taught": 1.0}  # parts of the presses
-FORGOTTEN = 0.005  # of what was learned, at each press
+FORGETTING_FACTOR = 0.005  # of what was learned, at each press
 UNLIKE = {
     "bolts 3 mm aside": Wear(misplaced=3e-3),
     "tips of 50 mm": Wear(tip=0.05),
@@ -189,8 +189,8 @@ def _aged(bench: Bench) -> Iterator[Row]:
                     "place_mm": one["place_mm"],
                 }
             if number < until * count:
-                codes[taught] = adapted.told(codes[taught].aged(FORGOTTEN), frame, forces)
-                layers[taught] = bench.learned_from(layers[taught].aged(FORGOTTEN), number)
+                codes[taught] = adapted.told(codes[taught].aged(FORGETTING_FACTOR), frame, forces)
+                layers[taught] = bench.learned_from(layers[taught].aged(FORGETTING_FACTOR), number)
 
 
 def tabled(every: list[Row]) -> list[Row]:

@@ -23,11 +23,11 @@ from .localisation.contact_tracks import (
     probe_presses,
     quiet_tracker,
 )
-from .localisation.law_lessons import LawLessons, law_told
+from .localisation.law_lessons import ContactLawLearner, updated_law
 
 # Share of what was learned before that each new session forgets: skins age between sessions, and errors of the model
 # that last for a session are in no covariance.
-FORGOTTEN = 0.1
+FORGETTING_FACTOR = 0.1
 
 LESS_PROBABLE = (
     "the presses of the calibration are less probable with what was learned of the contact layer than without"
@@ -55,8 +55,8 @@ def learn_layer(
     Where the session tells its presses and the force of a load cell, the mean over the hold of each press is one
     contact, told by its readings and the forces on the pads. Otherwise contacts are followed through the session as
     `apply` follows them. Each is also told by its readings alone: how that force differs from the pads' is the law
-    (`jaxeit.tracking.ContactLaw`). What was learned before is the start, less `FORGOTTEN` of it. `apply` and `live`
-    then follow contacts with the result.
+    (`jaxeit.tracking.ContactLaw`). What was learned before is the start, less `FORGETTING_FACTOR` of it. `apply` and
+    `live` then follow contacts with the result.
 
     Args:
         processing: how the session is cut and corrected; default: as the sessions of the calibration.
@@ -77,8 +77,8 @@ def learn_layer(
     processing = processing or calibration.processing
     levels = resting_levels(session, calibration.skin, processing)
     accept([session], calibration.skin, ignore_errors=ignore_errors, where=USED_PARTS)
-    before = None if calibration.layer is None else calibration.layer.aged(FORGOTTEN)
-    law = ContactLaw.unknown() if calibration.contact_law is None else calibration.contact_law.aged(FORGOTTEN)
+    before = None if calibration.layer is None else calibration.layer.aged(FORGETTING_FACTOR)
+    law = ContactLaw.unknown() if calibration.contact_law is None else calibration.contact_law.aged(FORGETTING_FACTOR)
     try:
         if _tells_presses(session):
             learned = _from_presses(calibration, measure(session, calibration.skin, processing), before, law, progress)
@@ -113,7 +113,7 @@ def _from_presses(
     for dv, forces, own in progress(zip(found.dv, force, errors, strict=True)):
         now = tracker.press(dv, forces, own, layer=layer)
         if tracker.told_by_pads(now.tracks, own).any():
-            law = law_told(law, tracker, now.tracks[0], dv, layer)
+            law = updated_law(law, tracker, now.tracks[0], dv, layer)
         layer = tracker.learned(now)
     assert layer is not None  # no measurements without a press
     return _Learned(tracker, layer, law)
@@ -124,7 +124,7 @@ def _from_use(
 ) -> _Learned:
     """What contacts tell that are followed through all frames."""
     tracker = quiet_tracker(calibration, blocks)
-    lessons = LawLessons(tracker, layer, law)
+    lessons = ContactLawLearner(tracker, layer, law)
     tracks = ContactTracks(tracker, smooth=False, layer=layer, watch=lessons)
     for block, found in estimated(calibration, progress(blocks)):
         tracks.add(block.time, block.change, found.force, found.standard_error)

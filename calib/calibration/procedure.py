@@ -38,7 +38,7 @@ from .hysteresis_loops import typical_loops
 from .layer import learn_layer
 from .localisation.electrode_places import PlacedElectrodes, place_electrodes
 from .localisation.locators import ContactLocator
-from .localisation.place_doubts import correction_that_harms, no_better_than_a_guess, require_on_sheet
+from .localisation.place_doubts import correction_that_harms, require_on_sheet, worse_than_baseline_note
 from .localisation.press_images import Imager, PressImages, prepare_imager
 from .logs.calibration import LogCalibration
 from .logs.evaluation import LogEvaluation
@@ -243,7 +243,7 @@ def _contradictions(found: _Found) -> tuple[str, ...]:
     """What presses contradict: single ones the others, pads that drift, and places of a stage that is off."""
     presses, held_out, seen = found.presses, found.held_out.pad_force, found.images.estimated.get("fitted")
     names, corrected = [pad.name for pad in found.skin.pads], found.response.model.field is not None
-    guessed = no_better_than_a_guess(presses.position, seen)
+    guessed = worse_than_baseline_note(presses.position, seen)
     seen = None if guessed else seen  # places that tell nothing contradict nobody
     return (
         *filter(None, [guessed]),

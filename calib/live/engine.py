@@ -31,7 +31,7 @@ from ..fitting.fields import Places
 from ..fitting.fields.places import nowhere
 from ..presses.streams import finite_mean
 from .follower import LiveFollower, followed_touches, padded
-from .plausibility import SILENT_PADS, SOUND, PadWatch, RestCheck
+from .plausibility import NO_FAULT, SILENT_PADS, PadWatch, RestCheck
 from .recalibrator import LiveRecalibrator
 from .results import NO_TOUCHES, FrameResult, KindEstimate, TouchEstimates
 
@@ -255,7 +255,7 @@ class Engine:
     ):
         """`proposal`: tells what touches the skin; None: this is not told. `check`: of rest levels; None: none."""
         self._rest, self._proposal, self._check = rest, proposal, check
-        self._rest_fault, self._watch = SOUND, PadWatch.of(calibration)
+        self._rest_fault, self._watch = NO_FAULT, PadWatch.of(calibration)
         self._rest_levels = RestAverage(rest)
         self._number = 0
         self._negative_since: int | None = None

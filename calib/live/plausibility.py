@@ -34,7 +34,7 @@ class RestFault(NamedTuple):
     refused: bool
 
 
-SOUND = RestFault("", refused=False)
+NO_FAULT = RestFault("", refused=False)
 
 RestCheck = Callable[[Float[np.ndarray, " readings"]], RestFault]
 

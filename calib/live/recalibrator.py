@@ -23,7 +23,7 @@ from ..calibration.recalibration.changes import Evidence, Recalibration
 from ..calibration.recalibration.ordinary_use import loaded_pressures
 from ..calibration.recalibration.press_noise import press_noise
 from ..calibration.recalibration.procedure import (
-    SeenContacts,
+    ObservedContacts,
     contact_loads,
     gain_prior,
     image_reference,
@@ -71,26 +71,26 @@ class _Contacts:
 
     def __init__(self, distance: float):
         self._distance = distance
-        self._rows: deque[tuple[int, SeenContacts]] = deque()  # number of the contact, one block of it
+        self._rows: deque[tuple[int, ObservedContacts]] = deque()  # number of the contact, one block of it
 
     def __len__(self) -> int:
         return len(self._rows)
 
-    def add(self, contact: int, block: SeenContacts) -> None:
+    def add(self, contact: int, block: ObservedContacts) -> None:
         same = [row for row in self._rows if row[0] == contact and self._near(row[1], block)]
         if any(row[1].force.sum() >= block.force.sum() for row in same):
             return
         kept = [row for row in self._rows if all(row is not one for one in same)]
         self._rows = deque([*kept, (contact, block)], maxlen=MAX_CONTACTS)
 
-    def _near(self, one: SeenContacts, other: SeenContacts) -> bool:
+    def _near(self, one: ObservedContacts, other: ObservedContacts) -> bool:
         return bool(np.linalg.norm(one.place - other.place) <= self._distance)
 
-    def seen(self) -> SeenContacts:
+    def seen(self) -> ObservedContacts:
         """All blocks, at the log gains of the first."""
         blocks = [block for _, block in self._rows]
         observed, place, force, slopes = (np.concatenate(part) for part in list(zip(*blocks, strict=True))[:4])
-        return SeenContacts(observed, place, force, slopes, blocks[0].gain)
+        return ObservedContacts(observed, place, force, slopes, blocks[0].gain)
 
 
 class LiveRecalibrator:
@@ -215,7 +215,7 @@ class LiveRecalibrator:
         )
         self._worker.start()
 
-    def _update(self, seen: SeenContacts) -> None:
+    def _update(self, seen: ObservedContacts) -> None:
         try:
             self._found = update_from_use(self._prior, self._reference, self._noise, seen)
         except Exception as error:  # of any type: the thread that takes the update over says it

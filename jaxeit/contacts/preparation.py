@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._compile import full_precision, require_known, verb
 from ..imaging.inputs import InverseError, real_numbers
-from ..imaging.untouched import sheet_of
+from ..imaging.untouched import background_of
 from ..imaging.whitening import Whitened, whitened_readings
 from ..kinds import require_kind
 from ..model.bases import Elements
@@ -123,13 +123,13 @@ def sheet_and_readings(
     if noise is None:
         raise InverseError(f"{name}: noise is None; give the standard deviation of each reading, V")
     _require_conductivity(sigma)
-    return sheet_of(model, untouched, sigma, channels), whitened_readings(model, noise, channels)
+    return background_of(model, untouched, sigma, channels), whitened_readings(model, noise, channels)
 
 
 def _require_conductivity(sigma: object) -> None:
     """Refuse a conductivity that no sheet has."""
     if not hasattr(sigma, "shape"):
-        return  # none, or what `sheet_of` refuses
+        return  # none, or what `background_of` refuses
     values = real_numbers("sigma", sigma, "S").ravel()
     bad = ~(np.isfinite(values) & (values > 0))
     if bad.any():

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._compile import by_platform, sequential_on_cpu, usually, verb
 from ..imaging.inputs import require_frames
-from ..imaging.missing import gap_of, lost_of_frame
+from ..imaging.missing import gap_of, missing_information
 from ..imaging.whitening import Whitening
 from .bump_responses import Responses
 from .fit import ContactFit, FitState, FrameResponse, contact_rows
@@ -167,7 +167,7 @@ class ContactFinder(eqx.Module):
         return Frame(y, complement @ complement, jnp.asarray(dimension, y.dtype), self.root)
 
     def _incomplete_frame(self, dv: Float[Array, " readings"]) -> Frame:
-        lost = lost_of_frame(self.whitening, dv)
+        lost = missing_information(self.whitening, dv)
         total = jnp.concatenate([self.compress, self.rest])
         signal, both = (gap_of(matrix, lost) for matrix in (self.compress, total))
         return Frame(signal.y, jnp.maximum(both.y @ both.y - signal.y @ signal.y, 0), both.rank, signal.root)

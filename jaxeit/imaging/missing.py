@@ -115,7 +115,7 @@ class Missing(NamedTuple, Generic[RowsType]):
     expected: Any
 
 
-class Lost(NamedTuple):
+class MissingInformation(NamedTuple):
     """What missing readings take away.
 
     | meaning                                                            | shape  |
@@ -160,7 +160,7 @@ def removed(library: ArrayLibrary, gram: Any, predict: Any, factor: Any) -> tupl
 # --- in JAX, of a `Whitening` ------------------------------------------------------------------------------------
 
 
-def mended_sums(
+def completed_sums_of_frame(
     whitening: Whitening, predict: Float[Array, "k k"], dv: Float[Array, " readings"]
 ) -> Float[Array, " k"]:
     """Sums of a frame that give the image of its finite readings."""
@@ -179,7 +179,7 @@ def mended_sums(
     return sums
 
 
-def lost_of_frame(whitening: Whitening, dv: Float[Array, " readings"]) -> Lost:
+def missing_information(whitening: Whitening, dv: Float[Array, " readings"]) -> MissingInformation:
     """What a frame loses by its readings that are not finite."""
     missing, known = _split(whitening, dv)
     return lost_by(_masked(whitening, known, missing), whitening.sums(known))
@@ -193,10 +193,10 @@ def _split(
     return whitening.channels & ~finite, jnp.where(whitening.channels & finite, dv, 0)
 
 
-def lost_by(missing: Missing[DenseRows], sums: Float[Array, " k"]) -> Lost:
+def lost_by(missing: Missing[DenseRows], sums: Float[Array, " k"]) -> MissingInformation:
     """The part of G that missing readings carry, of `DenseRows`, and the sums of the others."""
     rows, weighted = missing.rows.matrix, (missing.weight * missing.rows.matrix.T).T
-    return Lost(weighted.T @ rows, sums + weighted.T @ missing.expected)
+    return MissingInformation(weighted.T @ rows, sums + weighted.T @ missing.expected)
 
 
 def without_readings(whitening: Whitening, used: Bool[Array, " readings"]) -> tuple[Whitening, Float[Array, "k k"]]:
@@ -268,7 +268,7 @@ class Gap(NamedTuple):
     rank: Float[Array, ""]
 
 
-def gap_of(compress: Float[Array, "r k"], lost: Lost) -> Gap:
+def gap_of(compress: Float[Array, "r k"], lost: MissingInformation) -> Gap:
     """The gap, in numbers ``compress @ sums``; directions that only missing readings knew are left out."""
     metric = jnp.eye(len(compress), dtype=lost.sums.dtype) - compress @ lost.gram @ compress.T
     left, vectors = eigh(jax.lax.stop_gradient(metric))  # it does not depend on what was read

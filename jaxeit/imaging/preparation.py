@@ -24,7 +24,7 @@ from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Pro
 from .methods.one_step import one_step_image
 from .priors import AbstractPrior, Noser
 from .reconstruction import IterativeReconstructor, Provenance, Reconstructor
-from .untouched import sheet_of
+from .untouched import background_of
 from .whitening import Whitened, Whitening, whitened_readings
 
 T = TypeVar("T")
@@ -128,7 +128,7 @@ def prepare(
     method, prior, basis = method or OneStep(), prior or Noser(), basis or Pixels()
     require_choices(prior, method, basis, hyperparameter, noise is not None)
     image = basis if isinstance(basis, BasisMap) else basis.on(model)
-    sigma = sheet_of(model, untouched, sigma, channels)
+    sigma = background_of(model, untouched, sigma, channels)
     found = whitened_readings(model, noise, channels)
     problem = _problem(model, sigma, image, found, prior)
     chosen = _chosen(hyperparameter, problem, found)

@@ -19,7 +19,7 @@ from ..model.bases import AbstractPictured, Picture
 from ..notebook import card, picture
 from .inputs import InverseError, as_flags, require_frames, require_some
 from .methods import AbstractIterativeMethod, Problem
-from .missing import mended_sums, removed, without_readings
+from .missing import completed_sums_of_frame, removed, without_readings
 from .numpy_images import NumpyImages
 from .whitening import Whitening
 
@@ -143,7 +143,7 @@ def _completed(
     def complete(frame: tuple[Float[Array, " readings"], Float[Array, " k"]]) -> Float[Array, " k"]:
         dv, sums = frame
         there = jnp.isfinite(jnp.sum(sums))
-        found: Array = jax.lax.cond(there, lambda: sums, lambda: mended_sums(whitening, predict, dv))
+        found: Array = jax.lax.cond(there, lambda: sums, lambda: completed_sums_of_frame(whitening, predict, dv))
         return found
 
     frames = prod(sums.shape[:-1])

@@ -30,7 +30,7 @@ from .absolute.images import (
     LogConductivity,
     reading_weights,
 )
-from .absolute.one_frame import believed_image, picture_basis, variation_of
+from .absolute.one_frame import picture_basis, posterior_image, variation_of
 from .inputs import InverseError
 from .level_set import LevelSet, fitted_level, signed_distances
 
@@ -172,7 +172,7 @@ def segment(
     image = picture_basis(model, basis)
     penalty = variation_of(seen.used(model.dtype)) if penalty is None else penalty
     physics = LogConductivity(model, image, model.mean_background)
-    found = believed_image(physics, penalty, seen.target, lambda growth: seen.std(errors, growth))
+    found = posterior_image(physics, penalty, seen.target, lambda growth: seen.std(errors, growth))
     grid = on_grid(found.image, image.picture, (regions.pixels, regions.pixels))
     classes = half_height_classes(grid, regions.floor, regions.least, regions.weakest)
     classes = classes if start is None else _checked_start(start, classes.shape)
@@ -191,7 +191,7 @@ def _checked_start(start: Int[ArrayLike, "rows columns"], shape: tuple[int, ...]
     return classes
 
 
-class _Seen(NamedTuple):
+class _Observation(NamedTuple):
     """Readings, each (readings,) in V: of the model, of the reference, their change, what the model misses of them."""
 
     even: Float[Array, " readings"]
@@ -220,17 +220,19 @@ def _seen(
     reference: Float[ArrayLike, " readings"],
     frame: Float[ArrayLike, " readings"],
     missed: Float[ArrayLike, " readings"] | None,
-) -> _Seen:
+) -> _Observation:
     """The readings of both frames; raises InverseError for what is no frame of the model."""
     even = forward(model)
     before, after = (checked_frame(*one, even) for one in (("reference", reference), ("frame", frame)))
-    return _Seen(even, before, after - before, before - even if missed is None else jnp.asarray(missed, model.dtype))
+    return _Observation(
+        even, before, after - before, before - even if missed is None else jnp.asarray(missed, model.dtype)
+    )
 
 
 def _shaped(
     physics: LogConductivity,
     penalty: AbstractPenalty,
-    seen: _Seen,
+    seen: _Observation,
     before: Segmentation,
     borders: LevelSet,
 ) -> Segmentation:

@@ -11,7 +11,7 @@ from . import absolute  # which is imported on first use, since its solvers take
 from .inputs import InverseError, as_flags, require_real
 
 
-def sheet_of(
+def background_of(
     model: Model,
     untouched: Float[ArrayLike, " readings"] | None,
     sigma: Float[Array, " elements"] | None,

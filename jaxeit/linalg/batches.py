@@ -160,19 +160,19 @@ def _in_portions(
     return whole
 
 
-def written_levels(levels: Sequence[LevelPlan]) -> int:
-    """The first level that `swept_lanes` can eliminate with all below it, but never the root."""
+def unrolled_levels(levels: Sequence[LevelPlan]) -> int:
+    """The first level that `eliminated_lanes` can eliminate with all below it, but never the root."""
     wide = [number for number, level in enumerate(levels) if level.pivots > MAX_WRITTEN_PIVOTS]
     return max([0, *wide]) + 1
 
 
 def lane_plan(levels: Sequence[LevelPlan], unknowns: int, apart: bool = True) -> LanePlan:
-    """What `swept_lanes` needs for all levels from `written_levels` on.
+    """What `eliminated_lanes` needs for all levels from `unrolled_levels` on.
 
     Args:
         apart: whether subtrees that fit in a processor's cache follow one another; else all are eliminated at once.
     """
-    top = written_levels(levels)
+    top = unrolled_levels(levels)
     depth = round(np.log2(max(1, unknowns / SUBTREE_UNKNOWNS))) if apart else 0
     cut = min(max(depth, top), len(levels) - 1) if depth > 0 else len(levels)
     above, below = tuple(levels[top:cut]), tuple(levels[cut:])
@@ -188,7 +188,7 @@ def _gather_tables(levels: Sequence[LevelPlan]) -> list[Tables]:
     return [_level_tables(level, child) for level, child in zip(levels, below, strict=True)]
 
 
-def swept_lanes(plan: LanePlan, values: Float[Array, "nnz_and_2 lanes"]) -> Float[Array, "lanes m b b"]:
+def eliminated_lanes(plan: LanePlan, values: Float[Array, "nnz_and_2 lanes"]) -> Float[Array, "lanes m b b"]:
     """The update of the wide levels, after elimination of the narrow ones, the last one first.
 
     Args:

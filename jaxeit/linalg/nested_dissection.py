@@ -28,7 +28,7 @@ from jaxtyping import Array, Float, Integer
 from .._compile import by_platform, full_precision
 from ..registry import limited
 from .base import AbstractLinearSolver, SparsityPattern, index_arrays, jacobi_scale, on_device
-from .batches import lane_plan, lanewise, swept_lanes, written_levels
+from .batches import eliminated_lanes, lane_plan, lanewise, unrolled_levels
 from .dissection import dissect
 from .fronts import Front, LevelPlan, NestedDissectionFactor, NestedDissectionPlan, Panel
 from .lapack import portion_of, portioned
@@ -107,21 +107,21 @@ def _level_plan(level: Level) -> LevelPlan:
 
 
 def _suits_lanes(plan: NestedDissectionPlan) -> bool:
-    """Whether most fronts are narrow enough for `swept_lanes`."""
-    return written_levels(plan.levels) < len(plan.levels)
+    """Whether most fronts are narrow enough for `eliminated_lanes`."""
+    return unrolled_levels(plan.levels) < len(plan.levels)
 
 
 def _root_corner_lanes(
     plan: NestedDissectionPlan, apart: bool
 ) -> Callable[[Float[Array, "lanes nnz"]], Float[Array, "lanes r r"]]:
     """`_root_corner` of many matrices: lanes are the last axis of narrow fronts (`batches`), the first of wide ones."""
-    top = written_levels(plan.levels)
+    top = unrolled_levels(plan.levels)
     narrow = lax.optimization_barrier(lane_plan(plan.levels, plan.n, apart))
 
     def several(values: Float[Array, "lanes nnz"]) -> Float[Array, "lanes r r"]:
         scale, scaled = jax.vmap(partial(jacobi_scale, plan))(values)
         padded = jax.vmap(_padded)(scaled)
-        update = swept_lanes(narrow, lax.optimization_barrier(padded.T))
+        update = eliminated_lanes(narrow, lax.optimization_barrier(padded.T))
         found: Float[Array, "lanes r r"] = jax.vmap(beyond)(padded, update, scale)
         return found
 

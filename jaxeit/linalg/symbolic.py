@@ -79,10 +79,10 @@ def lay_out(pattern: SparsityPattern, owner: np.ndarray, depth: int) -> tuple[Le
     """Levels, from the root down, of the tree of this depth with heap numbers `owner`."""
     tree = _Tree(owner, depth)
     bounds = _boundaries(pattern, tree)
-    ups = [_up(tree, bounds, level) for level in range(len(bounds))]
+    ups = [_parent_rows(tree, bounds, level) for level in range(len(bounds))]
     entries = _entries(pattern, tree, bounds)
     return tuple(
-        Level(tree.pivots[level], ups[level], _down(tree, bounds, ups, level), entries[level])
+        Level(tree.pivots[level], ups[level], _child_rows(tree, bounds, ups, level), entries[level])
         for level in range(len(bounds))
     )
 
@@ -117,7 +117,7 @@ def _front_size(tree: _Tree, bounds: list[_Boundaries], level: int) -> int:
     return int(tree.pivots[level].shape[1] + bounds[level].size)
 
 
-def _up(tree: _Tree, bounds: list[_Boundaries], level: int) -> np.ndarray:
+def _parent_rows(tree: _Tree, bounds: list[_Boundaries], level: int) -> np.ndarray:
     bound = bounds[level]
     if level == 0:
         return np.zeros((1, bound.size), np.int64)
@@ -136,7 +136,7 @@ def _place(tree: _Tree, bounds: list[_Boundaries], level: int, fronts: np.ndarra
     return place
 
 
-def _down(tree: _Tree, bounds: list[_Boundaries], ups: list[np.ndarray], level: int) -> np.ndarray:
+def _child_rows(tree: _Tree, bounds: list[_Boundaries], ups: list[np.ndarray], level: int) -> np.ndarray:
     """The inverse of the children's `up`; an unknown that a child lacks points to its padding."""
     fronts, size = 1 << level, _front_size(tree, bounds, level)
     if level + 1 == len(bounds):

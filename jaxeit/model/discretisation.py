@@ -26,7 +26,7 @@ from ..notebook import MAX_LINES, Drawing, card
 from ..skin.description import Skin
 from ..skin.electrodes.base import touched
 from .fidelity import Fidelity, FidelityError, require_dtype
-from .metal_sheet import Coat, lay_coat
+from .metal_sheet import Coat, assembled_coat
 from .mixing import Mixing, padded_rows
 from .scene import Scene, SceneError
 from .system import System, system_arrays, system_of
@@ -165,7 +165,7 @@ def discretise(
     coat = None
     if metal is not None:
         index = unknowns.index[: len(sheet.points)]
-        coat = lay_coat(metal, sheet, pattern, index, arrays["under"][index], unknowns.electrode, solver, put)
+        coat = assembled_coat(metal, sheet, pattern, index, arrays["under"][index], unknowns.electrode, solver, put)
     effects = jax.tree.map(put, scene.effects)
     mixing = skin.protocol.mixing
     mixed = None if mixing is None else Mixing(*map(put, padded_rows(mixing)))

@@ -395,8 +395,8 @@ def fields(model: Model, theta: Coefficients) -> Fields:
     x = whole[: system.unknowns]
     terminal = x[system.electrode_dof]
     return Fields(
-        potential=x + _over(system, matrix.share[:, None] * terminal) - matrix.lift,
-        drop=x - _over(system, matrix.rest[:, None] * terminal),
+        potential=x + _under_electrodes(system, matrix.share[:, None] * terminal) - matrix.lift,
+        drop=x - _under_electrodes(system, matrix.rest[:, None] * terminal),
         terminal=terminal - matrix.lift,
         coat=coat_fields(model.coat, theta.coat, whole, matrix.share) if model.coat and theta.coat else None,
     )
@@ -427,7 +427,7 @@ def _matrix(model: Model, theta: Coefficients) -> tuple[AbstractPlan, Matrix]:
     return model.system.plan, matrix
 
 
-def _over(system: System, values: Float[Array, "electrodes k"]) -> Float[Array, "n k"]:
+def _under_electrodes(system: System, values: Float[Array, "electrodes k"]) -> Float[Array, "n k"]:
     """Each electrode's values at the unknowns under it, zero elsewhere."""
     return jnp.concatenate([values, jnp.zeros_like(values[:1])])[system.under]
 

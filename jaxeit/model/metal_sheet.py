@@ -88,7 +88,7 @@ class CoatFields(NamedTuple):
     drop: Float[Array, "contacts electrodes"]
 
 
-def lay_coat(
+def assembled_coat(
     metal: Space,
     space: Space,
     sheet: SparsityPattern,

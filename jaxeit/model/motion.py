@@ -124,7 +124,7 @@ def _corners_of_pieces(model: Model, unknown: np.ndarray) -> np.ndarray:
     return corners
 
 
-class _Follows(NamedTuple):
+class _NodeDisplacement(NamedTuple):
     """How nodes follow electrodes; see `Motion`."""
 
     electrode: np.ndarray
@@ -134,7 +134,7 @@ class _Follows(NamedTuple):
     reach: np.ndarray
 
 
-def _follow(mesh: Mesh, electrodes: list[np.ndarray]) -> _Follows:
+def _follow(mesh: Mesh, electrodes: list[np.ndarray]) -> _NodeDisplacement:
     rim = _Rim(mesh)
     middles = np.stack([mesh.chart[nodes].mean(0) for nodes in electrodes])
     away = np.linalg.norm(mesh.chart[:, None] - middles, axis=2)
@@ -161,7 +161,7 @@ def _follow(mesh: Mesh, electrodes: list[np.ndarray]) -> _Follows:
     along = np.where(rim.inside[:, None], rim.tangent, own[follows])
     bound = along[:, :, None] * own[follows][:, None, :]  # the part along the rim, turned with the rim
     step = share[:, None, None] * np.where(on_rim[follows][:, None, None], bound, np.eye(2))
-    return _Follows(follows, step, mesh.chart - middles[follows], radii, reach)
+    return _NodeDisplacement(follows, step, mesh.chart - middles[follows], radii, reach)
 
 
 class _Rim:

@@ -69,7 +69,7 @@ def number_unknowns(space: Space, touched: Sequence[Touched], ground: int | None
     complete = []
     for number, electrode in enumerate(touched):
         patch = np.unique(electrode.pieces.dofs)
-        _claim(owner, patch, number)
+        _assign_nodes(owner, patch, number)
         if electrode.contact > 0 and not electrode.lumped:
             complete.append(number)
         else:  # a perfect contact, or one in series: the whole electrode has one potential
@@ -80,7 +80,7 @@ def number_unknowns(space: Space, touched: Sequence[Touched], ground: int | None
     return Unknowns(index, len(names), places[names], index[dofs:], index[grounded], weight, complete)
 
 
-def _claim(owner: np.ndarray, patch: np.ndarray, number: int) -> None:
+def _assign_nodes(owner: np.ndarray, patch: np.ndarray, number: int) -> None:
     taken = owner[patch] >= 0
     if taken.any():
         other = int(owner[patch][taken][0])

@@ -9,7 +9,7 @@ import calib
 import jaxeit as je
 from calib.calibration.localisation import contact_tracks
 from calib.calibration.localisation.contact_tracks import ContactTracks
-from calib.calibration.localisation.law_lessons import LawLessons
+from calib.calibration.localisation.law_lessons import ContactLawLearner
 from calib.live.follower import LiveFollower
 from calib.session import SessionError
 from jaxeit.tracking import ContactLaw, GainField, LearnedLayer, TimedTracks, Track, Tracker, TrackerSettings, Tracking
@@ -110,7 +110,7 @@ def test_a_damaged_law_is_refused(calibration, tmp_path, name, change, message):
 def test_each_contact_teaches_its_largest_force_by_a_frame_of_its_own():
     """With the layer that was known before the contact began."""
     tracker = FakeTracker()
-    lessons = LawLessons(tracker, None, None)
+    lessons = ContactLawLearner(tracker, None, None)
     followed([0, 4, 10, 6, 0, 0, 20, 12, 0], watch=lessons, tracker=tracker)
     law = lessons.law()
     assert law.contacts == 2
@@ -120,7 +120,7 @@ def test_each_contact_teaches_its_largest_force_by_a_frame_of_its_own():
 
 
 def test_contacts_that_no_pad_tells_teach_nothing():
-    lessons = LawLessons(FakeTracker(), None, None)
+    lessons = ContactLawLearner(FakeTracker(), None, None)
     followed([0, 4, 10, 0], pads=False, watch=lessons)
     assert lessons.law().contacts == 0
 

@@ -11,7 +11,7 @@ import pytest
 import calib
 import jaxeit as je
 from calib.calibration import layer as layer_module, procedure
-from calib.calibration.layer import FORGOTTEN, learn_layer, render_layer
+from calib.calibration.layer import FORGETTING_FACTOR, learn_layer, render_layer
 from calib.calibration.localisation import contact_tracks
 from calib.calibration.localisation.contact_tracks import NotFollowed, quiet_tracker
 from calib.calibration.press_examples import PressExamples
@@ -174,7 +174,7 @@ def test_learning_starts_from_what_was_learned_before_less_a_part(calibration, s
         twice = learn_layer(once, use)
     first, second = tracker.started
     assert first is None
-    np.testing.assert_allclose(second.mean, (1 - FORGOTTEN) * layer.mean)
+    np.testing.assert_allclose(second.mean, (1 - FORGETTING_FACTOR) * layer.mean)
     assert (once.layer.contacts, twice.layer.contacts) == (CONTACTS, 2 * CONTACTS)
     assert tracker.steps > 2 * 100
 
@@ -189,7 +189,7 @@ def test_each_press_that_a_session_tells_is_one_contact(calibration, presses, tr
     assert (once.contact_law.contacts, again.contact_law.contacts) == (len(PLACES), 2 * len(PLACES))
     contacts = [None if one is None else one.contacts for one in tracker.started]
     assert contacts == [None, *range(1, 2 * len(PLACES))]
-    np.testing.assert_allclose(tracker.started[len(PLACES)].mean, (1 - FORGOTTEN) * layer.mean)
+    np.testing.assert_allclose(tracker.started[len(PLACES)].mean, (1 - FORGETTING_FACTOR) * layer.mean)
     assert (once.layer.contacts, again.layer.contacts) == (len(PLACES), 2 * len(PLACES))
 
 

@@ -11,8 +11,8 @@ from calib.calibration.evaluation import Evaluation
 from calib.calibration.localisation.locators import LOCATORS
 from calib.calibration.localisation.place_doubts import (
     correction_that_harms,
-    no_better_than_a_guess,
     require_on_sheet,
+    worse_than_baseline_note,
 )
 from calib.fitting.fields import FIELDS, single_places
 
@@ -106,7 +106,9 @@ def test_places_that_follow_nothing_are_no_better_than_a_guess(places):
     rng = np.random.default_rng(3)
     wild = rng.uniform(0.0, 0.12, (40, 2))
     wild[4] = np.nan
-    assert no_better_than_a_guess(places, wild).startswith("localisation is no better than guessing: contacts that EIT")
+    assert worse_than_baseline_note(places, wild).startswith(
+        "localisation is no better than guessing: contacts that EIT"
+    )
 
 
 @pytest.mark.parametrize(
@@ -123,12 +125,12 @@ def test_places_that_follow_nothing_are_no_better_than_a_guess(places):
 )
 def test_places_that_follow_the_stage_are_better(places, seen):
     noise = 2e-3 * np.random.default_rng(4).normal(size=(40, 2))
-    assert no_better_than_a_guess(places + noise, seen(places)) == ""
+    assert worse_than_baseline_note(places + noise, seen(places)) == ""
 
 
 def test_presses_at_one_place_tell_nothing():
     one = np.full((20, 2), 0.05)
-    assert no_better_than_a_guess(one, one + 0.01 * np.random.default_rng(5).normal(size=(20, 2))) == ""
+    assert worse_than_baseline_note(one, one + 0.01 * np.random.default_rng(5).normal(size=(20, 2))) == ""
 
 
 @pytest.mark.parametrize(("factor", "told"), [(0.2, False), (1.1, False), (3.6, True)])

@@ -18,7 +18,7 @@ from calib.calibration.recalibration.changes import Advice, Evidence, render
 from calib.calibration.recalibration.image_reference import fit_reference
 from calib.calibration.recalibration.ordinary_use import distinct, loaded_pressures, quiet_range, zero_and_loads
 from calib.calibration.recalibration.press_noise import press_noise
-from calib.calibration.recalibration.procedure import LoadedPads, SeenContacts, contact_loads, recorded, rest_levels
+from calib.calibration.recalibration.procedure import LoadedPads, ObservedContacts, contact_loads, recorded, rest_levels
 from calib.cli import main
 from calib.fitting.gain_update import GainDrift, GainPrior, GainUpdate, relative_covariance, update_gains
 from calib.fitting.intervals import NORMAL_MULTIPLE
@@ -332,7 +332,7 @@ def test_live_gains_and_zero_are_bounded(calibration):
     assert "not known" in follower.health
     follower._found = GainUpdate(np.array([2.0, -2.0, 0.0, 0.0]), np.eye(4), np.ones(4, bool), 1.0, 0.0, np.ones(1))
     follower._contacts.add(
-        1, SeenContacts(np.zeros(1), np.zeros((1, 2)), np.ones((1, 4)), np.ones((1, 4)), np.zeros(4))
+        1, ObservedContacts(np.zeros(1), np.zeros((1, 2)), np.ones((1, 4)), np.ones((1, 4)), np.zeros(4))
     )
     follower._worker = threading.Thread()
     follower.add(dv, np.zeros(4), False, 3001 * S)
@@ -345,7 +345,7 @@ def test_an_update_that_fails_leaves_the_one_before_and_says_so(calibration, mon
     told = []
     follower = LiveRecalibrator(calibration, tell=told.append)
     for number in range(8):
-        seen = SeenContacts(np.zeros(1), np.zeros((1, 2)), np.ones((1, 4)), np.ones((1, 4)), np.zeros(4))
+        seen = ObservedContacts(np.zeros(1), np.zeros((1, 2)), np.ones((1, 4)), np.ones((1, 4)), np.zeros(4))
         follower._contacts.add(number, seen)
 
     def update(raised=None):

@@ -11,7 +11,7 @@ from jax.extend.backend import backends
 import jaxeit as je
 from jaxeit._compile import compiler_options
 from jaxeit.linalg import NestedDissection, SparsityPattern, batches, nested_dissection
-from jaxeit.linalg.batches import MIN_BATCH, lane_count, lane_plan, swept_lanes, written_levels
+from jaxeit.linalg.batches import MIN_BATCH, eliminated_lanes, lane_count, lane_plan, unrolled_levels
 
 from ..helpers import skin_of
 from .test_solvers import SHAPES, as_pattern, relative, square_sheet
@@ -57,9 +57,9 @@ def sweeps(monkeypatch):
 
     def recorded(plan, values):
         lanes.append(values.shape[1])
-        return swept_lanes(plan, values)
+        return eliminated_lanes(plan, values)
 
-    monkeypatch.setattr(nested_dissection, "swept_lanes", recorded)
+    monkeypatch.setattr(nested_dissection, "eliminated_lanes", recorded)
     return lanes
 
 
@@ -75,7 +75,7 @@ def test_a_batch_is_its_matrices(contrast, sweeps):
     trace(plan, values)
     assert lane_count(values.dtype) in sweeps
     assert len(sweeps) == len(backends())
-    assert written_levels(plan.levels) == 1
+    assert unrolled_levels(plan.levels) == 1
     assert relative(corners(plan, values), one_by_one(plan, values)) < 1e-9 * 10**contrast
 
 
@@ -105,7 +105,7 @@ def test_narrow_fronts_under_wide_ones():
     matrix, coords = square_sheet(80, 0.5, np.ones(2))
     pattern, values = as_pattern(matrix, coords, [6400, 6401])
     plan = SOLVER.analyse(pattern)
-    assert 1 < written_levels(plan.levels) < len(plan.levels)
+    assert 1 < unrolled_levels(plan.levels) < len(plan.levels)
     assert lane_plan(plan.levels, plan.n).above
     assert lane_plan(plan.levels, plan.n).below
     batch = values * strengths(MIN_BATCH)
@@ -119,7 +119,7 @@ def test_small_batches_and_wide_fronts_keep_the_plain_program(sweeps):
     assert relative(corners(plan, few), one_by_one(plan, few)) < 1e-10
     pairs, places = np.tril_indices(160), np.random.default_rng(2).normal(size=(160, 2))
     dense = NestedDissection(leaf_size=100).analyse(SparsityPattern(160, *pairs, places, np.array([3, 8])))
-    assert written_levels(dense.levels) == len(dense.levels) > 1
+    assert unrolled_levels(dense.levels) == len(dense.levels) > 1
     entries = jnp.where(pairs[0] == pairs[1], 160.0, 1.0) * strengths(MIN_BATCH)
     assert relative(corners(dense, entries), one_by_one(dense, entries)) < 1e-10
     trace(plan, few)

@@ -9,7 +9,7 @@ from calib.check.eit.reading_order import transfer_matrix
 from calib.check.eit.untouched import UntouchedCheck
 from calib.check.report import Severity
 from calib.live.loop import LiveControl, LiveSettings, run_live
-from calib.live.plausibility import SILENT_PADS, SOUND, PadWatch, RestFault, inside_pads, rest_fault
+from calib.live.plausibility import NO_FAULT, SILENT_PADS, PadWatch, RestFault, inside_pads, rest_fault
 from calib.session import open_session
 
 from .test_live import CENTRES, READINGS, FakePrograms, S, arrival, calibration, rested, small_device, sources_of  # noqa: F401
@@ -49,10 +49,10 @@ def test_frames_at_rest_that_are_not_of_the_skin_are_named(lie, untouched, hones
 
 def test_nothing_is_said_of_honest_frames_at_rest(untouched, honest, bundled):
     used = np.ones(len(honest), bool)
-    assert rest_fault(untouched(honest, used)) == SOUND
+    assert rest_fault(untouched(honest, used)) == NO_FAULT
     dead = np.where(np.arange(len(honest)) % 7 == 0, np.nan, honest)
-    assert rest_fault(untouched(dead, used)) == SOUND
-    assert rest_fault(untouched(np.full(len(honest), np.nan), used)) == SOUND
+    assert rest_fault(untouched(dead, used)) == NO_FAULT
+    assert rest_fault(untouched(np.full(len(honest), np.nan), used)) == NO_FAULT
     for path in bundled:
         with open_session(path) as session:
             skin = je.skin.parse_skin(session.skin_toml, path.name)
@@ -61,7 +61,7 @@ def test_nothing_is_said_of_honest_frames_at_rest(untouched, honest, bundled):
 
 
 def test_forces_of_a_wrong_order_are_not_valid_until_the_rest_levels_are_right(calibration):  # noqa: F811
-    answers = [WRONG, SOUND]
+    answers = [WRONG, NO_FAULT]
     engine = rested(calibration, check=lambda untouched: answers.pop(0))
     result = engine.step(arrival([15.0, 20.0]))
     assert engine.faults == result.faults == (WRONG.words,)

@@ -8,7 +8,7 @@ from jaxeit.tracking import ContactLaw, LearnedLayer, Track, Tracker, Tracking
 NEAR = 0.02
 
 
-def law_told(
+def updated_law(
     law: ContactLaw, tracker: Tracker, told: Track, change: np.ndarray, layer: LearnedLayer | None
 ) -> ContactLaw:
     """The law after a contact that the pads tell of, which is looked at once more by its readings alone.
@@ -26,10 +26,10 @@ def law_told(
     return law.told(alone[0], told.force)
 
 
-class LawLessons:
+class ContactLawLearner:
     """Compares contacts that are followed with the pads to what their readings alone tell; `watch` of `ContactTracks`.
 
-    Of each contact that is alone, the frame of its largest force is asked (`law_told`).
+    Of each contact that is alone, the frame of its largest force is asked (`updated_law`).
 
     Args:
         layer: with which the contacts are followed from the first frame on.
@@ -64,5 +64,5 @@ class LawLessons:
         if self._strongest is None:
             return
         layer = self._layer if self._quiet is None else self._tracker.learned(self._quiet)
-        self._law = law_told(self._law, self._tracker, *self._strongest, layer)
+        self._law = updated_law(self._law, self._tracker, *self._strongest, layer)
         self._strongest = None

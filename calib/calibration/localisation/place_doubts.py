@@ -39,7 +39,7 @@ def require_on_sheet(skin: je.Skin, places: Places | None, locator: AbstractLoca
         )
 
 
-def no_better_than_a_guess(position: Float[np.ndarray, "n 2"], place: Float[np.ndarray, "n 2"] | None) -> str:
+def worse_than_baseline_note(position: Float[np.ndarray, "n 2"], place: Float[np.ndarray, "n 2"] | None) -> str:
     """A note where the places of images err by more than the middle of all presses does; otherwise empty.
 
     A stage that lies aside as a whole is another matter: places of images then follow those of the stage.

@@ -75,7 +75,7 @@ class LoadedPads(NamedTuple):
         )
 
 
-class SeenContacts(NamedTuple):
+class ObservedContacts(NamedTuple):
     """Contacts as the update of relative gains takes them; the logs of their forces are linear in the log gains.
 
     | field    | meaning                                                             | shape     | unit |
@@ -211,9 +211,9 @@ def contact_loads(
     return loads.rows(single)
 
 
-def seen_contacts(calibration: Calibration, loads: LoadedPads, gain: np.ndarray) -> SeenContacts:
+def seen_contacts(calibration: Calibration, loads: LoadedPads, gain: np.ndarray) -> ObservedContacts:
     """Contacts with the forces of their pads at log gains (pads,)."""
-    return SeenContacts(loads.observed, loads.place, *_expected(calibration, loads, gain), gain)
+    return ObservedContacts(loads.observed, loads.place, *_expected(calibration, loads, gain), gain)
 
 
 def image_reference(calibration: Calibration) -> ImageReference:
@@ -229,7 +229,9 @@ def image_reference(calibration: Calibration) -> ImageReference:
         raise SessionError(f"calibration: {error}; recalibrate from presses of known force") from None
 
 
-def update_from_use(prior: GainPrior, reference: ImageReference, noise: PressNoise, seen: SeenContacts) -> GainUpdate:
+def update_from_use(
+    prior: GainPrior, reference: ImageReference, noise: PressNoise, seen: ObservedContacts
+) -> GainUpdate:
     """Update gains relative to each other by contacts; the common gain keeps its mean, and its deviation grows."""
     total = seen.force.sum(1)
     mean, spread, bend = reference.predict(seen.place, total)
@@ -422,11 +424,11 @@ def recorded(
         session=origin[1],
         since=_recorded(calibration),
         until=origin[0],
-        notes=(*notes, *_doubts(kind, update, pads, np.sqrt(np.diag(update.covariance)))),
+        notes=(*notes, *_undetermined_notes(kind, update, pads, np.sqrt(np.diag(update.covariance)))),
     )
 
 
-def _doubts(kind: Evidence, update: GainUpdate, pads: tuple[str, ...], error: np.ndarray) -> list[str]:
+def _undetermined_notes(kind: Evidence, update: GainUpdate, pads: tuple[str, ...], error: np.ndarray) -> list[str]:
     """What the data do not determine."""
     unknown = [
         f"{name} (+- {100 * e:.0f} %)" for name, ok, e in zip(pads, update.determined, error, strict=True) if not ok

@@ -51,13 +51,13 @@ def standstill_findings(log: LogBlocks) -> Iterator[Finding]:
     unrelated = (np.abs(log.correlations) < RELATED_CORRELATION).all(0)
     best = int(np.median(np.abs(log.correlations), axis=1).argmax())
     for rows in _standstills(log, unrelated & _still(log.force_spread)):
-        if goes_on(log.values[rows, best], log.spreads[best]):
+        if has_usual_variation(log.values[rows, best], log.spreads[best]):
             what = f"the force stays at {np.median(log.force[rows]):.4g} N {_when(log, rows)} while "
             what += f"column {log.column[best]} of {log.signal} goes on changing"
             yield Finding(Severity.ERROR, "/streams/force", what, "check the load cell and its cable, and record again")
     still = np.all([_still(spreads) for spreads in log.spreads], axis=0)
     for rows in _standstills(log, unrelated & still):
-        if goes_on(log.force[rows], log.force_spread):
+        if has_usual_variation(log.force[rows], log.force_spread):
             what = f"no channel changes {_when(log, rows)} while the force goes on changing"
             remedy = "check the sensor, its tube and its cable, and whether it was pressed"
             yield Finding(Severity.WARNING, f"/streams/{log.signal}", what, remedy)
@@ -73,7 +73,7 @@ def _standstills(log: LogBlocks, flag: np.ndarray) -> list[slice]:
     return [slice(int(log.rows[a][0]), int(log.rows[b - 1][-1]) + 1) for a, b in runs]
 
 
-def goes_on(part: np.ndarray, spreads: np.ndarray) -> bool:
+def has_usual_variation(part: np.ndarray, spreads: np.ndarray) -> bool:
     """Whether values of a part go up and down as they usually do: creep and the filling of a pad go one way."""
     low, high = np.percentile(part, SPREAD_PERCENTILES)
     if not _changes(part) or high - low < GOES_ON * usual(spreads):

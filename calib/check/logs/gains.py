@@ -12,7 +12,7 @@ import numpy as np
 from ..parts import Part, flagged_part, stepped_part
 from ..report import Finding, Severity
 from .blocks import LOG_BLOCKS, LogBlocks, usual
-from .following import RELATED_CORRELATION, goes_on
+from .following import RELATED_CORRELATION, has_usual_variation
 
 MIN_RATIO = 4.0  # of a change of gain: friction, creep and wear change it by less
 MIN_STEP_SCATTERS = 5.0  # of the gains of the blocks in both parts
@@ -88,7 +88,7 @@ def _sign_change(log: LogBlocks, channel: int) -> _Change | None:
     if part is None:
         return None
     sides = _sides(log, int(np.flatnonzero(used)[part.row]))
-    if not all(goes_on(log.force[side], log.force_spread) for side in sides):
+    if not all(has_usual_variation(log.force[side], log.force_spread) for side in sides):
         return None
     before, after = (np.median(log.force[side]) for side in sides)
     late = part._replace(first=False)  # the sign at the start counts as the right one
@@ -108,7 +108,7 @@ def _gain_change(log: LogBlocks, channel: int) -> _Change | None:
         ratio = _ratio_at_levels(kept, moved, sides)
         if ratio is None or abs(np.log(ratio)) <= np.log(MIN_RATIO):
             continue
-        if all(goes_on(kept[side], spreads) for side in sides):
+        if all(has_usual_variation(kept[side], spreads) for side in sides):
             return _Change(Part(row, False), log.starts[used], of_force, ratio)
     return None
 

@@ -101,7 +101,7 @@ def require_steps(steps: int, tolerance: Any = 0.0) -> None:
 
 
 @verb
-def _unexplained(
+def _relative_misfit(
     found: Float[Array, " readings"], known: Float[Array, " readings"], there: Bool[Array, " readings"]
 ) -> Float[Array, ""]:
     left: Array = jnp.linalg.norm(jnp.where(there, found - known, 0)) / jnp.linalg.norm(known)
@@ -123,7 +123,7 @@ def require_explained(
         what: kind of content that was fitted.
         hint: what ends the message, asked for where there is one.
     """
-    left: Array = _unexplained(found, known, there)
+    left: Array = _relative_misfit(found, known, there)
     if not is_traced(left) and not left < MAX_UNEXPLAINED:
         raise InverseError(
             f"no {what} explains {name}: {left:.0%} of it is left; give a frame of this skin, readings in the order of "

@@ -86,7 +86,7 @@ def absolute_image(
     physics, own = LogConductivity(model, image, level), frame_error(readings, error)
     used = jnp.sum(jnp.isfinite(readings), dtype=model.dtype)
     penalty = variation_of(used) if penalty is None else penalty
-    found = believed_image(physics, penalty, readings, lambda growth: growth * own)
+    found = posterior_image(physics, penalty, readings, lambda growth: growth * own)
     seen = physics.sigma(found.image), level * jnp.exp(found.image)
     return AbsoluteImage(*seen, image.picture, found.errors, found.misfit, found.converged)
 
@@ -105,7 +105,7 @@ def picture_basis(model: Model, basis: AbstractBasis | BasisMap | None) -> Basis
     return image
 
 
-class BelievedImage(NamedTuple):
+class PosteriorImage(NamedTuple):
     """An image; errors of the readings that were believed, V; the root mean square of what the image leaves, over
     them; whether the fit converged."""
 
@@ -115,12 +115,12 @@ class BelievedImage(NamedTuple):
     converged: Bool[Array, ""]
 
 
-def believed_image(
+def posterior_image(
     physics: LogConductivity,
     penalty: AbstractPenalty,
     target: Float[Array, " readings"],
     errors: Callable[[float], Float[Array, " readings"]],
-) -> BelievedImage:
+) -> PosteriorImage:
     """The image, fitted anew with larger errors where it leaves more of the readings than they tell."""
     growth = 1.0
     for _ in range(1 + MORE_FITS):
@@ -130,4 +130,4 @@ def believed_image(
         if not misfit > BELIEVED_MISFIT:
             break
         growth *= float(misfit)
-    return BelievedImage(found, std, misfit, converged)
+    return PosteriorImage(found, std, misfit, converged)
