@@ -24,6 +24,11 @@ round: settings of the fit for a skin that only round tips touch (`LoadSettings.
 further sheets: singles and near pairs, and tips of the shapes above, which these settings do not know.
 
 chest: the same singles, pairs and edges on a curved skin.
+
+bound: pairs and edges as the fit believes frames to be: Gaussian loads on its own mesh, under its own law, with errors
+drawn from the covariance that it marginalises (noise, gain, shapes). Of such frames the odds of the fit are the ratio
+of likelihoods, but for Laplace's approximation, and no other rule tells more pairs at so many edges called several
+(Neyman and Pearson 1933). "several": odds above one; "at_goal": above the odds that one in twenty edges exceeds.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -39,8 +44,10 @@ from scipy.stats import binom, chi2, norm
 
 import jaxeit as je
 from jaxeit.contacts import LoadFitter, LoadKind, Loads, LoadShape
-from jaxeit.contacts.loads.comparison import load_shape
+from jaxeit.contacts.loads.comparison import evidences, load_shape
 from jaxeit.contacts.loads.fits import FrameFits
+from jaxeit.contacts.loads.pressure import pad_rows, padded_forms
+from jaxeit.contacts.loads.programs import sensitivities_of
 from jaxeit.contacts.loads.search import FrameSearch
 
 from .clock import seconds
@@ -61,6 +68,8 @@ TIP, TIP_SPREAD, RING = 0.018, 0.006, 0.015  # m: radius and spread of a flat ti
 TILT = 0.8  # relative change of pressure from the middle of a tilted tip to its rim
 BINS = (0.0, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0)  # of stated probability
 FIRST_SEED = 340
+SEVERAL = (LoadKind.TWO, LoadKind.MORE)
+KEPT = 0.95  # of edges, which the goal wants to stay one contact
 
 
 class Touch(NamedTuple):
@@ -381,6 +390,63 @@ def measure_round(run: Run) -> Iterator[Row]:
     yield {"round": [{"touch": row.pop("name")} | row for row in means(every, "name")]}
 
 
+def measure_bound(run: Run) -> Iterator[Row]:
+    count, distances, lengths = run.sizes((40, NEAR, LENGTHS), (1, NEAR[:1], LENGTHS[:1]))
+    model, rows = fit_model(), []
+    low, high = corners(model)
+    for only_round in (False, True):
+        fitter = bound_fitter(model, je.contacts.LoadSettings.round_tips() if only_round else None)
+        rng = np.random.default_rng(FIRST_SEED + 130)
+        given = [(f"edge, {1e3 * length:.0f} mm", LoadKind.EDGE, length) for length in lengths]
+        given += [(f"two, 1:1, {1e3 * distance:.0f} mm", LoadKind.TWO, distance) for distance in distances]
+        odds = {
+            name: np.array(
+                [several_odds(fitter, kind, m, along, size, rng) for m, along in _lines(rng, count, low, high)]
+            )
+            for name, kind, size in given
+        }
+        edges = np.concatenate([found for name, found in odds.items() if name.startswith("edge")])
+        limit = float(np.quantile(edges, KEPT))
+        for name, found in odds.items():
+            row = {"touch": name, "only_round": only_round, "frames": count}
+            rows.append(row | {"several": float(np.mean(found > 0)), "at_goal": float(np.mean(found > limit))})
+        print(f"only round: {only_round}", flush=True)
+    yield {"bound": rows}
+
+
+def bound_fitter(model: je.Model, settings: je.contacts.LoadSettings | None) -> LoadFitter:
+    """A fitter on the sheet as it is, with noise 60 dB below the readings."""
+    v0 = np.asarray(je.forward(model))
+    noise = np.full(len(v0), 1e-3 * np.sqrt(np.mean(v0**2)))
+    fitter: LoadFitter = je.contacts.prepare_loads(model, settings, noise=noise, sigma=model.background)
+    return fitter
+
+
+def several_odds(
+    fitter: LoadFitter, kind: LoadKind, middle: np.ndarray, along: np.ndarray, size: float, rng: np.random.Generator
+) -> float:
+    """Log odds of several loads against one or an edge, in a frame of a kind that is drawn from the fitter's belief.
+
+    Fits also start from the true loads, so that none is lost to a search.
+    """
+    belief = fitter.belief
+    usual = np.append(np.asarray(belief.prior_mean)[:1], np.log(LOAD))
+    if kind is LoadKind.TWO:
+        ends = middle + np.array([[-0.5], [0.5]]) * size * along
+        rows = np.concatenate([ends, np.tile(usual, (2, 1))], 1)
+    else:
+        rows = np.concatenate([middle, usual, 0.5 * size * along])[None]
+    true = sensitivities_of(belief.sheet, *belief.to_jax(pad_rows(rows), padded_forms(kind)))
+    value = np.asarray(true.value, float)
+    y = value + FrameFits(belief, value).error_factor(true) @ rng.normal(size=len(value))
+    frame = FrameFits(belief, y)
+    fits = FrameSearch(frame, fitter.starts, None).search()
+    fits[kind] = min(fits[kind], frame.best_fit(kind, [rows]), key=lambda fit: fit.deviance)
+    found = evidences(frame, fits)
+    several, other = ([found[k] for k in found if (k in SEVERAL) is wanted] for wanted in (True, False))
+    return float(np.logaddexp.reduce(several) - np.logaddexp.reduce(other))
+
+
 def measure_coverage(run: Run) -> Iterator[Row]:
     seeds, count = run.sizes((4, 8), (1, 1))
     yield {"coverage": means(list(_cases(range(FIRST_SEED + 50, FIRST_SEED + 50 + seeds), count, _told)), "case")}
@@ -472,6 +538,7 @@ PARTS = {
     "kinds": measure_kinds,
     "drawn": measure_drawn,
     "round": measure_round,
+    "bound": measure_bound,
     "coverage": measure_coverage,
     "ellipses": measure_ellipses,
     "chest": measure_chest,
