@@ -1,7 +1,8 @@
 """Changes of all streams during the presses of a recording, for the checks that compare streams with each other."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -26,7 +27,8 @@ class PressEvidence:
     | site        | place of the tip; None: not known                                | (rows, 2)           | m    |
     | force       | change of the load cell; None: no force stream                   | (rows,)             | N    |
     | pressure    | change of the columns; None: no pressure stream                  | (rows, columns)     | Pa   |
-    | arriving    | the same over the second half of the ramp, before the tip slides | (rows, columns)     | Pa   |
+    | arriving    | reads the same over the second half of the ramp, before the tip  | (rows, columns)     | Pa   |
+    |             | slides; None: no pressure stream                                 |                     |      |
     | seen        | rows whose frames were read                                      | (seen,)             |      |
     | eit         | change of their frames with standard errors; None: no EIT stream | (seen, readings)    | V    |
     | rests       | mean frame of the rest before each of them; None: no EIT stream  | (seen, readings)    | V    |
@@ -38,7 +40,7 @@ class PressEvidence:
     site: np.ndarray | None
     force: np.ndarray | None
     pressure: np.ndarray | None
-    arriving: np.ndarray | None
+    arriving: Callable[[], np.ndarray] | None
     seen: np.ndarray
     eit: WindowMeans | None
     rests: np.ndarray | None
@@ -74,17 +76,18 @@ def gather_evidence(streams: Mapping[str, Stream], presses: PressColumns, window
         site=_sites(streams, presses, number),
         force=None if force is None else force[:, 0],
         pressure=change.get("pressure"),
-        arriving=press_means(streams["pressure"], _ramps(within)).change.mean if "pressure" in streams else None,
+        arriving=partial(_arriving, streams["pressure"], within) if "pressure" in streams else None,
         seen=seen,
         eit=None if eit is None else eit.change,
         rests=None if eit is None else eit.rest,
     )
 
 
-def _ramps(windows: PressWindows) -> PressWindows:
-    """Windows whose hold is the second half of the ramp."""
+def _arriving(pressure: Stream, windows: PressWindows) -> np.ndarray:
+    """Mean change over the second half of each ramp, (rows, columns) Pa; few checks ask for it."""
     begin, end = windows.ramp.T
-    return replace(windows, hold=np.stack([begin + (end - begin) // 2, end], 1))
+    late = replace(windows, hold=np.stack([begin + (end - begin) // 2, end], 1))
+    return np.asarray(press_means(pressure, late).change.mean)
 
 
 def _chosen(presses: PressColumns, windows: PressWindows, rows: np.ndarray) -> tuple[PressColumns, PressWindows]:

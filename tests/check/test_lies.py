@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -654,7 +655,7 @@ def found_by_pads(skin, site, pressure, arriving=None):
         "site": site,
         "force": np.full(24, 10.0),
         "pressure": pressure,
-        "arriving": 0.5 * pressure if arriving is None else arriving,
+        "arriving": partial(np.copy, 0.5 * pressure if arriving is None else arriving),
         "tip_diameter": np.zeros(24),
         "times": numbers * SECOND,
     }

@@ -56,7 +56,7 @@ def pad_response_findings(evidence: PressEvidence, skin: je.Skin, start: int) ->
         yield from _silent_findings(evidence, skin, response, np.where(known, -1, alone), unfelt)
     falling = [*_falling_findings(evidence, skin, strongest, largest, start)]
     yield from falling
-    late = [] if falling or _arrives(evidence, alone) else [*_late_findings(evidence, alone, size)]
+    late = [] if falling else [*_late_findings(evidence, alone, size)]
     yield from late
     if under.size and not falling and not late:
         yield from _order_findings(evidence, skin, alone, np.nan_to_num(pressure), strongest, start)
@@ -155,7 +155,8 @@ def _late_findings(evidence: PressEvidence, alone: np.ndarray, size: np.ndarray)
     """
     agreed = {rows: _agreement(alone, size, rows) for rows in range(-MAX_LATE_ROWS, MAX_LATE_ROWS + 1)}
     best = max(agreed, key=lambda rows: (agreed[rows], -abs(rows)))
-    if best and agreed[best] >= MIN_LATE_SHARE and agreed[0] <= agreed[best] - MIN_LATE_GAIN:
+    gained = best and agreed[best] >= MIN_LATE_SHARE and agreed[0] <= agreed[best] - MIN_LATE_GAIN
+    if gained and not _arrives(evidence, alone):
         presses = f"{counted(abs(best), 'press', 'presses')} {'late' if best > 0 else 'early'}"
         what = (
             f"the pads respond {presses}: {agreed[best]:.0%} of the presses so moved lie on the pad that responds "
@@ -168,8 +169,9 @@ def _late_findings(evidence: PressEvidence, alone: np.ndarray, size: np.ndarray)
 def _arrives(evidence: PressEvidence, alone: np.ndarray) -> bool:
     """Whether the listed pads respond first, as under tips that slide onto other pads; streams that are late do not
     show it."""
-    arriving = evidence.arriving
-    return arriving is not None and _agreement(alone, np.abs(np.nan_to_num(arriving)), 0) >= MIN_LATE_SHARE
+    if evidence.arriving is None:
+        return False
+    return _agreement(alone, np.abs(np.nan_to_num(evidence.arriving())), 0) >= MIN_LATE_SHARE
 
 
 def _agreement(alone: np.ndarray, size: np.ndarray, rows: int) -> float:
