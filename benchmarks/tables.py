@@ -93,13 +93,10 @@ SPEED = {
 COMPILED = {("forward", "jaxeit float64"), ("gradient", "jaxeit float64"), ("jacobian", "jaxeit float64, pixels")}
 
 
-def _runs(forward: Row, jacobian: Row) -> dict[str, list[Row]]:
-    return {"forward": forward["rows"], "jacobian": jacobian["rows"], "gradient": jacobian.get("gradient_rows", [])}
-
-
 def _speed(forward: Row, jacobian: Row) -> Iterator[Row]:
     """Forward solves, gradients and Jacobians onto pixels, by tool and mesh; then what ours take to compile."""
-    runs = _runs(forward, jacobian)
+    gradients = jacobian.get("gradient_rows", [])
+    runs = {"forward": forward["rows"], "jacobian": jacobian["rows"], "gradient": gradients}
     for (kind, tool), label in SPEED.items():
         yield from (row | {"tool": label} for row in runs[kind] if row["tool"] == tool)
     for kind, tool in SPEED:

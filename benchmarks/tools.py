@@ -111,9 +111,9 @@ def basis_of(model: je.Model, pixels: bool) -> je.model.BasisMap:
     return (je.Pixels(PIXELS) if pixels else je.Elements()).on(model)
 
 
-def jacobian(problem: Problem, pixels: bool, dtype: str = "float64") -> Tool:
-    model = problem.model(dtype)
-    return as_tool(compiled(je.jacobian, model, basis_of(model, pixels), options=je.compiler_options()), dtype)
+def jacobian(problem: Problem, pixels: bool, dtype: str = "float64", *, options: bool = True) -> Tool:
+    model, chosen = problem.model(dtype), je.compiler_options() if options else None
+    return as_tool(compiled(je.jacobian, model, basis_of(model, pixels), options=chosen), dtype)
 
 
 def projection(problem: Problem, pixels: bool = True) -> sp.csr_array | None:
@@ -145,15 +145,9 @@ def onto(name: str, prepare: Callable[..., Tool], *rest: Any, elements: int = 24
     return pixels, Entry(f"{name}, elements", partial(prepare, pixels=False), *rest, largest=elements, **more)
 
 
-def jacobian_inside(problem: Problem, pixels: bool) -> Tool:
-    """As part of a program that was not given `je.compiler_options`."""
-    model = problem.model()
-    return as_tool(compiled(je.jacobian, model, basis_of(model, pixels)))
-
-
 JACOBIAN = (
     *onto("jaxeit float64", jacobian, elements=120),  # beyond, the matrix alone takes 1.3 GB
-    onto("jaxeit float64, without compiler options", jacobian_inside)[0],
+    onto("jaxeit float64, without compiler options", partial(jacobian, options=False))[0],
     onto("jaxeit float32", partial(jacobian, dtype="float32"), loose=MAX_FLOAT32_DIFFERENCE)[0],
     *onto(adjoint.NAME, jacobian_by_hand, elements=120),
     Entry(f"{pyeit.NAME}, elements", pyeit.prepare_jacobian, pyeit, 30),  # it inverts a dense matrix
@@ -313,20 +307,19 @@ def batched(problem: Problem, batch: int, dtype: str = "float64") -> Tool:
     return lambda sigma: tool(shapes * sigma)
 
 
-def share(prepare: Callable[[Problem], Tool], cells: int, number: int, count: int) -> Tool:
+def share(prepare: Callable[[Problem], Tool], problem: Problem, number: int, count: int) -> Tool:
     """The tool for one of ``count`` equal shares of the contacts."""
-    problem = Problem(cells)
     tool, shapes = prepare(problem), np.array_split(contacts(problem), count)[number]
     return lambda sigma: np.stack([tool(one) for one in shapes * sigma])
 
 
 def one_by_one(prepare: Callable[[Problem], Tool]) -> Callable[[Problem], Tool]:
-    return lambda problem: share(prepare, problem.cells, 0, 1)
+    return lambda problem: share(prepare, problem, 0, 1)
 
 
 def in_processes(prepare: Callable[[Problem], Tool]) -> Callable[[Problem], Tool]:
     """A tool in as many processes as there are cores, each with its share of the contacts at hand."""
-    return lambda problem: InProcesses(partial(share, prepare, problem.cells))
+    return lambda problem: InProcesses(partial(share, prepare, Problem(problem.cells)))  # without what is cached
 
 
 BATCH = (
