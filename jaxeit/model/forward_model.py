@@ -477,7 +477,11 @@ def energy(model: Model, theta: Coefficients, x: Fields) -> Float[Array, "a b"]:
     """``A(theta; x_a, x_b)`` for all pairs of fields, in ohm."""
     system = model.system
     gradients = system.gradients(x.potential)
-    sheet = jnp.einsum("era,erb->ab", theta.sigma[:, None, None] * gradients, gradients)
+    # As a product of stored matrices, whose derivative by sigma is one as well: XLA would gather the potentials again
+    # for each use, and multiply with the axes of a product of three transposed.
+    rows = jax.lax.optimization_barrier(gradients.reshape(-1, gradients.shape[2]))
+    sigma = jnp.broadcast_to(theta.sigma[:, None], gradients.shape[:2]).reshape(-1, 1)
+    sheet = (sigma * rows).T @ rows
     drop = x.drop[system.contact_dofs]
     mass = theta.contact[system.contact_electrode][:, None, None] * system.contact_mass
     own = sheet + jnp.einsum("pia,pij,pjb->ab", drop, mass, drop)
