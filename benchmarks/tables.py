@@ -78,13 +78,18 @@ def _evaluation(summary: Row) -> Iterator[Row]:
 SPEED = {
     ("forward", "jaxeit float64"): "forward, jaxeit",
     ("forward", "jaxeit float64, called from Python"): "forward, jaxeit, called from Python",
+    ("forward", "jaxeit float64, without compiler options"): "forward, jaxeit, in your own `jax.jit`",
     ("forward", "CHOLMOD by hand"): "forward, CHOLMOD driven by hand",
     ("forward", "SuperLU by hand"): "forward, SuperLU driven by hand",
     ("forward", "EIDORS"): "forward, EIDORS",
     ("forward", "pyEIT"): "forward, pyEIT",
     ("gradient", "jaxeit float64"): "gradient of a loss, jaxeit",
+    ("gradient", "jaxeit float64, without compiler options"): "gradient of a loss, jaxeit, in your own `jax.jit`",
     ("gradient", "adjoint by hand"): "gradient of a loss, adjoint formula by hand",
     ("jacobian", "jaxeit float64, pixels"): "Jacobian onto 900 pixels, jaxeit",
+    ("jacobian", "jaxeit float64, without compiler options, pixels"): (
+        "Jacobian onto 900 pixels, jaxeit, in your own `jax.jit`"
+    ),
     ("jacobian", "adjoint by hand, pixels"): "Jacobian onto 900 pixels, adjoint formula by hand",
     ("jacobian", "EIDORS, pixels"): "Jacobian onto 900 pixels, EIDORS",
 }
