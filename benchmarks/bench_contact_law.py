@@ -30,7 +30,7 @@ import numpy as np
 
 import jaxeit as je
 from calib.calibration.localisation.contact_tracks import ContactTracks
-from calib.calibration.localisation.law_lessons import ContactLawLearner
+from calib.calibration.localisation.learned.law_lessons import ContactLawLearner
 from jaxeit.tracking import ContactLaw, LearnedLayer, Track, Tracker, Tracking, fit_model_error, prepare_tracker
 
 from .force_ways import HELD, LIFTED, PAD_ERROR, SECONDS

@@ -18,7 +18,7 @@ import numpy as np
 
 import calib
 import jaxeit as je
-from calib.calibration.force_maps import force_model
+from calib.calibration.application.force_maps import force_model
 from calib.live.engine import FramePrograms
 
 from .bench_live import made_up

@@ -275,7 +275,7 @@ def learning(run: Run) -> Iterator[Row]:
     examples = training.Examples(kind=kind, **drawn)
     optimiser = training.optax.adamw(1e-3)
     network = training.new_network(inputs + 2 * pads, jax.random.key(0))
-    state = training.State(network, optimiser.init(eqx.filter(network, eqx.is_array)), jnp.asarray(0))
+    state = training.TrainingState(network, optimiser.init(eqx.filter(network, eqx.is_array)), jnp.asarray(0))
     epoch = eqx.filter_jit(training.epoch)
     with jax.numpy_dtype_promotion("standard"):
         call = partial(epoch, state, optimiser, examples, jnp.ones(30), jax.random.key(1))

@@ -44,10 +44,10 @@ from scipy.stats import binom, chi2, norm
 
 import jaxeit as je
 from jaxeit.contacts import LoadFitter, LoadKind, Loads, LoadShape
-from jaxeit.contacts.loads.comparison import evidences, load_shape
-from jaxeit.contacts.loads.fits import FrameFits
+from jaxeit.contacts.loads.fits.comparison import evidences, load_shape
+from jaxeit.contacts.loads.fits.kinds import FrameFits
+from jaxeit.contacts.loads.fits.programs import sensitivities_of
 from jaxeit.contacts.loads.pressure import pad_rows, padded_forms
-from jaxeit.contacts.loads.programs import sensitivities_of
 from jaxeit.contacts.loads.search import FrameSearch
 
 from .clock import seconds

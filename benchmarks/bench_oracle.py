@@ -27,7 +27,7 @@ from scipy.stats import norm
 import calib
 import jaxeit as je
 from calib.calibration import Calibration, KnownForces, OrdinaryUse, learn_layer
-from calib.calibration.application import FORCE_MAP_FORMAT, TRACKS
+from calib.calibration.application.map_files import FORCE_MAP_FORMAT, TRACKS
 from calib.calibration.evaluation import Evaluation
 from calib.calibration.localisation.contact_tracks import TRACK_ARRAYS
 from calib.calibration.localisation.ellipses import INSIDE_90

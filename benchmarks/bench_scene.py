@@ -91,7 +91,7 @@ def frame(model: je.Model, load: jax.Array) -> jax.Array:
 def histories(effects, block, pads, load, pattern):
     """Loads, pads and readout of one block; effects that a scene does not list are not there."""
     key, still = jax.random.key(0), jnp.zeros(ROWS)
-    line = fx.Line(key, jnp.asarray(1 / 180), still, still, pattern[:0])
+    line = fx.HistoryInputs(key, jnp.asarray(1 / 180), still, still, pattern[:0])
 
     def run(family, series, stream=None, line=line):
         mine = fx.chosen(effects, family, stream)

@@ -247,7 +247,7 @@ def by_hand() -> list[Row]:
         {"point": "loops of least squares", "field": "one", "first": "5", "now": "1", "aim": "one",
          "reached": "yes", "held": "`jaxeit/least_squares`"},
         {"point": "places that handle missing readings", "field": "one", "first": "5", "now": "1", "aim": "one algebra",
-         "reached": "yes", "held": "`jaxeit/imaging/missing.py`"},
+         "reached": "yes", "held": "`jaxeit/imaging/readings/missing.py`"},
         {"point": "files that a new curve, prior or effect touches", "field": "1 to 2", "first": "3 to 5",
          "now": "1, and one line", "aim": "1, and one line", "reached": "yes",
          "held": "`tests/registry/test_one_class.py`"},

@@ -18,7 +18,7 @@ import calib
 from calib.calibration import Calibration
 from calib.live import Engine, ReceivedFrame
 from calib.live.loop import LiveControl
-from calib.live.page import Page
+from calib.live.views.page import Page
 from calib.report.document import write_report
 from calib.runtime import set_up
 from tests.browser import Browser, browser_path

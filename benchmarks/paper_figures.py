@@ -25,11 +25,11 @@ import jaxeit as je
 from calib.bench import Bench, load_bench, simulate
 from calib.bench.motion import loads_at, planned_motion
 from calib.calibration import Calibration
-from calib.report.figures.curved_sheet import curved_figure
 from calib.report.figures.force_series import ForceSeries, force_series_figure
 from calib.report.figures.moving_contact import WITHIN, Stroke, moving_contact_figure
 from calib.report.figures.parts import write_figure
 from calib.report.figures.presses import localisation_figure, sensitivity_figure
+from calib.report.figures.skin.curved_sheet import curved_figure
 from calib.runtime import set_up
 
 from .harness import ROOT, Question, Run

@@ -21,7 +21,7 @@ import optax
 import calib
 import jaxeit as je
 from calib.bench import TrainingFrames
-from calib.bench.scene_frames import SHARD_FRAMES
+from calib.bench.training.scene_frames import SHARD_FRAMES
 from calib.learning.inputs import Compression, calibrated_forces, fit_compression
 from calib.learning.scenes import noise_of, scenes_for, training_bench
 from jaxeit.contacts.loads.learned.proposal import components, standardised

@@ -41,7 +41,7 @@ def __getattr__(name: str) -> Any:
     except AttributeError:
         if name.startswith("_"):
             raise
-        hints = import_module("._missing_names", __name__)  # on an error only
+        hints = import_module(".messages.missing_names", __name__)  # on an error only
         raise AttributeError(hints.message(name, __all__), name=name) from None
 
 

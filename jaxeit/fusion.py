@@ -32,8 +32,8 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import DTypeLike
 
 from ._compile import is_traced, require_known, verb
-from .kinds import is_number, require_kind, shown
 from .linalg.array_libraries import real_array
+from .messages.kinds import is_number, require_kind, shown
 from .model.bases import AbstractPictured, overlap_areas
 from .notebook import card, picture
 from .skin.description import Skin

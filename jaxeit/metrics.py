@@ -35,8 +35,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Integer, Real, Shaped
 
 from ._compile import full_precision, is_traced, verb
-from .kinds import shown, stated
 from .linalg.array_libraries import real_array
+from .messages.kinds import shown, stated
 from .registry import AbstractChoice, Registry, limited
 
 __all__ = [

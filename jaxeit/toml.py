@@ -36,7 +36,7 @@ import numpy as np
 
 from .budget import current_budget, require
 from .files import open_regular
-from .spelling import did_you_mean, nearest
+from .messages.spelling import did_you_mean, nearest
 
 __all__ = [
     "TomlError",

@@ -25,7 +25,7 @@ def after(effect, series, *, interval=0.005, cuts=(), temperature=None, baromete
     pattern = np.asarray(pattern, np.int32).reshape(-1, 4)
     state, out = _start(effect, series[0]), []
     for number, (block, heat, weight) in enumerate(zip(*(np.split(a, cuts) for a in (series, *air)), strict=True)):
-        line = fx.Line(*jax.tree.map(jnp.asarray, (block_key(number), interval, heat, weight, pattern)))
+        line = fx.HistoryInputs(*jax.tree.map(jnp.asarray, (block_key(number), interval, heat, weight, pattern)))
         block, state = _call(effect, block, state, line)
         out.append(block)
     return np.concatenate(out)

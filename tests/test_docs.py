@@ -19,7 +19,7 @@ import calib
 import jaxeit as je
 from calib.cli import _parser, main
 from calib.cli.recipe_options import recipe_of
-from jaxeit._missing_names import WORDS
+from jaxeit.messages.missing_names import WORDS
 
 FENCE = re.compile(r"^( *)```(\w*)(?: title=\"(.+?)\")?\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
 SHELL = ("sed ", "python ")

@@ -141,15 +141,16 @@ def test_names_in_docstrings_become_links(names):
         "see [`Noser`][jaxeit.imaging.Noser], [`je.Noser(0.5)`][jaxeit.imaging.Noser], `prior` and [`Noser`](x)"
     )
     assert names.linked("`Noser`, `je.Noser`") == "`Noser`, [`je.Noser`][jaxeit.imaging.Noser]"
-    assert names.linked("see `Problem`", "jaxeit.contacts.loads.programs") == "see `Problem`"  # another of that name
+    assert names.linked("see `Path`", "jaxeit.effects.stage") == "see [`Path`][jaxeit.effects.Path]"
+    assert names.linked("see `Path`", "calib.session.writer") == "see `Path`"  # that of the standard library
 
 
 def test_programs_are_found_by_what_they_import(names):
     used = sys.modules["programs"].used_in
     public, rooms = names.identifiers(), names.rooms()
     text = "from jaxeit.imaging import (\n    Laplace,\n    Noser as Prior,\n)\nje.Fidelity.draft()\n"
-    text += "calib.session.importers.About"
-    assert used(text, public, rooms) == {"Laplace", "Noser", "Fidelity", "About"}
+    text += "calib.session.importers.StatedFacts"
+    assert used(text, public, rooms) == {"Laplace", "Noser", "Fidelity", "StatedFacts"}
     assert used("effects.Creep()", public, rooms) == set()
     assert used("effects.Creep()", public, rooms, "from jaxeit import effects") == {"Creep"}
 

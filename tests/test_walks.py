@@ -14,10 +14,10 @@ import pytest
 
 import calib
 import jaxeit as je
-from calib.calibration.frame_blocks import FrameBlocks, estimated
+from calib.calibration.application.frame_blocks import FrameBlocks, estimated
 from calib.live.engine import Engine
 from calib.live.loop import FrameQueue, LiveControl
-from calib.live.page import Page
+from calib.live.views.page import Page
 from calib.presses.table import resting_levels
 from calib.record.plan import StreamPlan
 from calib.record.wire.messages import Frame

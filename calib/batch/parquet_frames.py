@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..bench import BenchError, open_training_frames
-from ..bench.frame_shards import SHARDS, TABLES_EXTRA, Shard, by_frame
-from ..bench.training_frames import TrainingFrames, claim_folder
+from ..bench.training.frame_shards import SHARDS, TABLES_EXTRA, Shard, by_frame
+from ..bench.training.training_frames import TrainingFrames, claim_folder
 from ..session.importers.child import library
 
 

@@ -17,12 +17,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxeit.kinds import require_kind
+from jaxeit.messages.kinds import require_kind
 
 from ..bench import BenchError, FrameSet
-from ..bench.frame_shards import SHARDS, TABLES_EXTRA, Shard
-from ..bench.scene_frames import SceneFrames
-from ..bench.training_frames import FRAMES_VERSION, card_of, claim_folder
+from ..bench.training.frame_shards import SHARDS, TABLES_EXTRA, Shard
+from ..bench.training.scene_frames import SceneFrames
+from ..bench.training.training_frames import FRAMES_VERSION, card_of, claim_folder
 from ..runtime import settings, take_over
 from ..session import file_hash, replacing
 from ..session.importers.child import library

@@ -34,7 +34,7 @@ from ..calibration.calibration import Calibration
 from ..calibration.given import are_logs
 from ..calibration.logs.calibration import LogCalibration
 from ..calibration.procedure import calibrate
-from ..calibration.recipe import Recipe, recipe_or_default
+from ..calibration.recipes.recipe import Recipe, recipe_or_default
 from ..report.document import write_report
 from ..report.figures.parts import require_matplotlib
 from ..runtime import settings, take_over

@@ -31,9 +31,9 @@ Example:
 from .bench import Bench, BenchError, Companion, Timing, load_bench, presets
 from .costs import PartCost, measure_costs, render_costs
 from .dataset import grid, simulate_contacts, write_data_set
-from .random_scenes import Footprint, RandomScenes
 from .simulation import SIMULATION, simulate
-from .training_frames import FrameSet, TrainingFrames, open_training_frames
+from .training.random_scenes import Footprint, RandomScenes
+from .training.training_frames import FrameSet, TrainingFrames, open_training_frames
 
 __all__ = [
     "SIMULATION",

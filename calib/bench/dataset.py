@@ -18,8 +18,8 @@ from .simulation import Progress
 
 FORMAT = "skin-dataset"
 CONTACTS_PER_DEVICE = 64  # contacts that are sent to a device at a time
-# Contacts that are solved together. From `jaxeit.linalg.batches.MIN_BATCH` on, a solve takes a quarter to a half of the
-# time, but the program takes twice as long to compile, which pays only for many contacts.
+# Contacts that are solved together. From `jaxeit.linalg.multifrontal.batches.MIN_BATCH` on, a solve takes a quarter
+# to a half of the time, but the program takes twice as long to compile, which pays only for many contacts.
 FEW_TOGETHER, MANY_TOGETHER, MANY = 8, 32, 1000
 
 

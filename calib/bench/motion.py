@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from .bench import Bench
 
 
-class Motion(NamedTuple):
+class BenchMotion(NamedTuple):
     """The plan of a bench as its stage follows it; a contact is a tip.
 
     | field  | meaning                                                  | shape                  | unit |
@@ -44,16 +44,16 @@ class LoadState(NamedTuple):
     progress: Float[np.ndarray, "time contacts"]
 
 
-def planned_motion(bench: Bench) -> Motion:
+def planned_motion(bench: Bench) -> BenchMotion:
     """The motion of an ideal stage, exactly as planned."""
     also = bench.companions
     offsets = np.array([(0.0, 0.0), *(c.offset for c in also)])
     forces = np.stack([bench.press_forces, *(np.full(len(bench.sites), c.force) for c in also)], 1)
     start = bench.blank + np.arange(len(bench.sites)) * bench.period
-    return Motion(bench, bench.sites[:, None] + offsets, start, np.ones(len(start)), forces)
+    return BenchMotion(bench, bench.sites[:, None] + offsets, start, np.ones(len(start)), forces)
 
 
-def loads_at(motion: Motion, times: Float[np.ndarray, " time"]) -> LoadState:
+def loads_at(motion: BenchMotion, times: Float[np.ndarray, " time"]) -> LoadState:
     """Loads and slides at the given times (s)."""
     timing = motion.bench.timing
     press = np.clip(np.searchsorted(motion.start, times, side="right") - 1, 0, None)

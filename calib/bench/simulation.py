@@ -13,13 +13,13 @@ import jax
 import numpy as np
 
 import jaxeit as je
-from jaxeit.kinds import require_kind
+from jaxeit.messages.kinds import require_kind
 
 from ..session import PressTable, SessionFacts, SessionWriter, Status, StreamFacts
 from ..session.given import call_on
 from ..session.hdf5.storage import disk_full_named
 from .bench import Bench, BenchError
-from .motion import Motion
+from .motion import BenchMotion
 from .streams import AbstractSimulatedStream, SampleBlock, SimulatedStreams, simulated_streams
 
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
@@ -264,7 +264,7 @@ def _presses(bench: Bench) -> PressTable:
     )
 
 
-def _truth(motion: Motion) -> dict[str, tuple[np.ndarray, str]]:
+def _truth(motion: BenchMotion) -> dict[str, tuple[np.ndarray, str]]:
     bench, contacts = motion.bench, motion.forces.shape[1]
     truth = {"contact_position": (motion.places[:, 0], "m")}
     if contacts > 1:

@@ -21,7 +21,7 @@ from jaxeit import effects as fx
 
 from .bench import Bench
 from .interpolation import frame_solver
-from .motion import Motion, barometer_rise, loads_at, phase_count, planned_motion, temperature_rise
+from .motion import BenchMotion, barometer_rise, loads_at, phase_count, planned_motion, temperature_rise
 from .press_frames import PressFrames
 from .resolution import require_resolved
 
@@ -52,7 +52,7 @@ class AbstractSimulatedStream(ABC):
     kind: fx.StreamKind
     rate: float
 
-    def __init__(self, bench: Bench, motion: Motion, key: Any):
+    def __init__(self, bench: Bench, motion: BenchMotion, key: Any):
         self.bench, self.motion, self._key = bench, motion, key
         self._readouts = fx.chosen(bench.scene.effects, fx.AbstractReadoutEffect, self.kind)
         self._clocks = fx.chosen(bench.scene.effects, fx.AbstractClockEffect, self.kind)
@@ -95,14 +95,14 @@ class AbstractSimulatedStream(ABC):
         """Times (s) of the samples of a block; those of the last block continue beyond the end of the recording."""
         return (number * BLOCK_ROWS + np.arange(BLOCK_ROWS)) / self.rate
 
-    def line(self, number: int, purpose: int) -> fx.Line:
+    def line(self, number: int, purpose: int) -> fx.HistoryInputs:
         """Inputs of history effects for a block; each ``purpose`` has its own random key."""
         times = self.times(number)
         key = jax.random.fold_in(jax.random.fold_in(self._key, purpose), number)
         warmth, air = jnp.asarray(temperature_rise(self.bench, times)), jnp.asarray(barometer_rise(self.bench, times))
         pattern = jnp.asarray(self.bench.scene.skin.protocol.pairs, jnp.int32)
         pattern = pattern if self.kind is fx.StreamKind.EIT else pattern[:0]
-        return fx.Line(key, jnp.asarray(1 / self.rate), warmth, air, pattern)
+        return fx.HistoryInputs(key, jnp.asarray(1 / self.rate), warmth, air, pattern)
 
     def _received(self, number: int, times: np.ndarray, values: np.ndarray) -> SampleBlock:
         used = min(BLOCK_ROWS, self.samples - number * BLOCK_ROWS)
@@ -128,7 +128,10 @@ class AbstractSimulatedStream(ABC):
 
 @eqx.filter_jit
 def history(
-    effects: tuple[fx.AbstractHistoryEffect, ...], series: Float[Array, "time channels"], states: Any, line: fx.Line
+    effects: tuple[fx.AbstractHistoryEffect, ...],
+    series: Float[Array, "time channels"],
+    states: Any,
+    line: fx.HistoryInputs,
 ) -> tuple[Float[Array, "time channels"], tuple[Any, ...]]:
     """Compiled form of `jaxeit.effects.history`."""
     return fx.history(effects, series, states, line)
@@ -162,7 +165,7 @@ class SimulatedPressure(AbstractSimulatedStream):
 
     kind = fx.StreamKind.PRESSURE
 
-    def __init__(self, bench: Bench, motion: Motion, key: Any, model: je.Model):
+    def __init__(self, bench: Bench, motion: BenchMotion, key: Any, model: je.Model):
         super().__init__(bench, motion, key)
         self._effects = fx.chosen(bench.scene.effects, fx.AbstractPneumaticEffect)
         self._response = pad_pressures(bench, motion, model)
@@ -193,7 +196,9 @@ class SimulatedPressure(AbstractSimulatedStream):
         return np.asarray(out), state
 
 
-def pad_pressures(bench: Bench, motion: Motion, model: je.Model) -> Float[np.ndarray, "presses contacts places pads"]:
+def pad_pressures(
+    bench: Bench, motion: BenchMotion, model: je.Model
+) -> Float[np.ndarray, "presses contacts places pads"]:
     """Pressure in each pad per newton of each tip (Pa/N) at places along its slide; one place without a slide."""
     response = je.pad_response(bench.scene.skin, model)
     steps = np.linspace(0, 1, SLIDE_PLACES if any(bench.slide) else 1)
@@ -218,7 +223,7 @@ class SimulatedEit(AbstractSimulatedStream):
 
     kind = fx.StreamKind.EIT
 
-    def __init__(self, bench: Bench, motion: Motion, key: Any, model: je.Model, tolerance: float):
+    def __init__(self, bench: Bench, motion: BenchMotion, key: Any, model: je.Model, tolerance: float):
         super().__init__(bench, motion, key)
         self.model, self._tolerance = model, tolerance
         self._solver = frame_solver(model, bench.tip_diameter)
@@ -340,7 +345,7 @@ class SimulatedStreams:
     """All simulated streams of a bench."""
 
     bench: Bench
-    motion: Motion
+    motion: BenchMotion
     eit: SimulatedEit
     pressure: SimulatedPressure
     force: SimulatedForce
@@ -367,7 +372,7 @@ def simulated_streams(bench: Bench, fidelity: je.Fidelity) -> SimulatedStreams:
     )
 
 
-def _moved(bench: Bench, key: Any) -> Motion:
+def _moved(bench: Bench, key: Any) -> BenchMotion:
     """The planned motion with the errors of the stage; companions move with the first tip."""
     plan = planned_motion(bench)
     effects = fx.chosen(bench.scene.effects, fx.AbstractStageEffect)

@@ -22,11 +22,11 @@ Example:
     print(found.force[strongest], found.standard_error[strongest], found.position[strongest])  # N, N, m
 """
 
-from .application import apply
+from .application.force_maps import ForceEstimate, force_map
+from .application.map_files import apply
 from .archives.opening import load_calibration
 from .calibration import Calibration
 from .evaluation import Evaluation
-from .force_maps import ForceEstimate, force_map
 from .layer import learn_layer
 from .localisation.locators import (
     LOCATORS,
@@ -42,7 +42,7 @@ from .logs.recalibration import assess_log, recalibrate_log
 from .procedure import calibrate, evaluate
 from .recalibration.changes import Recalibration
 from .recalibration.procedure import AbstractEvidence, KnownForces, OrdinaryUse, assess, recalibrate
-from .recipe import Recipe, RecipeError
+from .recipes.recipe import Recipe, RecipeError
 
 __all__ = [
     "LOCATORS",

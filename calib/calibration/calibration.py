@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 import jaxeit as je
-from jaxeit.kinds import require_unmasked
+from jaxeit.messages.kinds import require_unmasked
 from jaxeit.notebook import card
 from jaxeit.tracking import ContactLaw, LearnedLayer
 
@@ -30,7 +30,7 @@ from .localisation.electrode_places import PlacedElectrodes
 from .localisation.locators import AbstractLocator, locate
 from .press_examples import PressExamples
 from .recalibration.changes import Recalibration
-from .recipe import Recipe
+from .recipes.recipe import Recipe
 
 FORMAT = "skin-calibration"
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from jaxeit.kinds import require_kind
+from jaxeit.messages.kinds import require_kind
 from jaxeit.model import require_dtype
 
 from ..session import Session, SessionError

@@ -11,10 +11,10 @@ from jaxeit.tracking import ContactLaw, LearnedLayer, Tracker
 from ..check.acceptance import accept
 from ..presses.table import PressMeasurements, Processing, measure, resting_levels
 from ..session import Session, SessionError
+from .application.force_maps import USED_PARTS
+from .application.frame_blocks import FrameBlocks, Progress, estimated
 from .calibration import Calibration
 from .fitted_sessions import is_calibrated_from
-from .force_maps import USED_PARTS
-from .frame_blocks import FrameBlocks, Progress, estimated
 from .localisation.contact_tracks import (
     ContactTracks,
     NotFollowed,
@@ -23,7 +23,7 @@ from .localisation.contact_tracks import (
     probe_presses,
     quiet_tracker,
 )
-from .localisation.law_lessons import ContactLawLearner, updated_law
+from .localisation.learned.law_lessons import ContactLawLearner, updated_law
 
 # Share of what was learned before that each new session forgets: skins age between sessions, and errors of the model
 # that last for a session are in no covariance.

@@ -43,10 +43,10 @@ from .localisation.press_images import Imager, PressImages, prepare_imager
 from .logs.calibration import LogCalibration
 from .logs.evaluation import LogEvaluation
 from .logs.procedure import calibrate_logs, evaluate_log
-from .own_classes import import_note
 from .press_examples import press_examples, press_probes
 from .recalibration.agreement import agreement_of_presses
-from .recipe import Recipe, recipe_or_default
+from .recipes.own_classes import import_note
+from .recipes.recipe import Recipe, recipe_or_default
 
 STAGES = ("reading", "model and images", "fitting", "holding out")
 # Further stages, if the recipe asks for them.

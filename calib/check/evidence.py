@@ -8,8 +8,8 @@ import numpy as np
 
 from ..presses.corrections import WindowMeans
 from ..presses.means import hold_positions, press_means
-from ..presses.times import PressColumns, select
-from ..presses.windows import PressWindows
+from ..presses.timing.times import PressColumns, select
+from ..presses.timing.windows import PressWindows
 from ..session import PressTable, Stream
 
 MAX_COMPARED_PRESSES = 40  # whose frames are read, spread over the recording, because frames are long

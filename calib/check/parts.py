@@ -11,7 +11,7 @@ MAX_STRAY = 0.15  # of the presses, that may contradict a part
 CLEAREST_STEP = 1e9  # scatters: levels without any scatter, such as those of a dead channel, step no clearer
 
 
-class Part(NamedTuple):
+class RowRange(NamedTuple):
     """The rows before ``row`` if ``first``, otherwise those from ``row`` on."""
 
     row: int
@@ -34,13 +34,13 @@ def time_text(first: bool, seconds: float) -> str:
     return f"up to {seconds:.1f} s after the start" if first else f"from {seconds:.1f} s after the start on"
 
 
-def flagged_part(flag: np.ndarray) -> Part | None:
+def flagged_part(flag: np.ndarray) -> RowRange | None:
     """The part of the rows (rows,) in time order that holds nearly all flagged rows and no other ones, if any does."""
     rows = len(flag)
     best, fewest = None, np.inf
     for row in range(MIN_ROWS, rows - MIN_ROWS + 1):
         for first in (True, False):
-            part = Part(row, first)
+            part = RowRange(row, first)
             stray = int((part.mask(rows) != flag).sum())
             if stray < fewest:
                 best, fewest = part, stray

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..presses.onsets import OnsetDelay
+from ..presses.timing.onsets import OnsetDelay
 from .eit.reading_order import OrderCheck
 
 

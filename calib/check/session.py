@@ -7,7 +7,7 @@ import numpy as np
 
 import jaxeit as je
 
-from ..presses.onsets import OnsetDelay
+from ..presses.timing.onsets import OnsetDelay
 from ..record.journal.records import EventCode
 from ..session import Session
 from ..session.given import require_session, require_skin_or_none

@@ -32,7 +32,13 @@ COMMANDS = {
     "recover": "make a session from the journal that a crash left",
     "completion": "print a script that completes commands and options in a shell",
 }
-"""What each command does; ``name`` is the module ``commands/name_command.py`` with `add_arguments` and `run`."""
+"""What each command does."""
+ROOMS = {
+    "recordings": ("simulate", "check", "import", "export", "record", "recover"),
+    "calibrations": ("calibrate", "recalibrate", "evaluate", "apply", "live", "image"),
+    "skins": ("bench", "design", "train", "doctor", "completion"),
+}
+"""Where each command is: ``commands/room/name_command.py``, with `add_arguments` and `run`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -122,7 +128,8 @@ def parser_with(loaded: Collection[str], argv: Sequence[str] = ()) -> argparse.A
     for name, text in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         if name in loaded:
-            module = import_module(f".commands.{name}_command", __name__)
+            room = next(room for room, names in ROOMS.items() if name in names)
+            module = import_module(f".commands.{room}.{name}_command", __name__)
             command.set_defaults(command=module.run, parser=command)
             command.words = argv
             module.add_arguments(command)

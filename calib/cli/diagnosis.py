@@ -29,7 +29,7 @@ _REQUIREMENT = re.compile(r"([A-Za-z0-9_.\-]+)\s*>=\s*([0-9.]+)")
 
 
 @dataclass(frozen=True)
-class Line:
+class DiagnosisLine:
     """One finding: ``remedy`` says what to do, or is empty; a ``note`` does not make the machine unusable."""
 
     name: str
@@ -48,18 +48,18 @@ class Line:
         return f"{mark}  {self.name}: {self.text}" + (f"\n      -> {self.remedy}" if self.remedy else "")
 
 
-def examine() -> list[Line]:
+def examine() -> list[DiagnosisLine]:
     """Run all checks in order and return their findings."""
     return [line for check in _CHECKS for line in _guarded(check)]
 
 
-def _guarded(check: Callable[[], Iterator[Line]]) -> list[Line]:
+def _guarded(check: Callable[[], Iterator[DiagnosisLine]]) -> list[DiagnosisLine]:
     name = check.__name__.strip("_")
     try:
         return list(check())
     except Exception as error:  # a broken installation may raise any error
         text = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-        return [Line(name, text, _unset(_named_in(str(error))) or "install jaxeit again")]
+        return [DiagnosisLine(name, text, _unset(_named_in(str(error))) or "install jaxeit again")]
 
 
 def _named_in(text: str) -> list[str]:
@@ -75,46 +75,46 @@ def _unset(names: list[str]) -> str:
     return f"correct or unset {given}" if names else ""
 
 
-def _python() -> Iterator[Line]:
+def _python() -> Iterator[DiagnosisLine]:
     text = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
-    yield Line("python", text, "" if sys.version_info >= (3, 11) else "use Python 3.11 or later")
+    yield DiagnosisLine("python", text, "" if sys.version_info >= (3, 11) else "use Python 3.11 or later")
 
 
-def _packages() -> Iterator[Line]:
-    yield Line("jaxeit", metadata.version("jaxeit"))
+def _packages() -> Iterator[DiagnosisLine]:
+    yield DiagnosisLine("jaxeit", metadata.version("jaxeit"))
     for requirement in metadata.requires("jaxeit") or []:
         found = _REQUIREMENT.match(requirement)
         if found and "extra ==" not in requirement:
             yield _package(found[1], found[2])
     try:
-        yield Line("matplotlib", metadata.version("matplotlib"))
+        yield DiagnosisLine("matplotlib", metadata.version("matplotlib"))
     except metadata.PackageNotFoundError:
-        yield Line("matplotlib", "not there, needed for --report", "pip install 'jaxeit[report]'", note=True)
+        yield DiagnosisLine("matplotlib", "not there, needed for --report", "pip install 'jaxeit[report]'", note=True)
 
 
-def _package(name: str, least: str) -> Line:
+def _package(name: str, least: str) -> DiagnosisLine:
     try:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
-        return Line(name, "not there", f"pip install '{name}>={least}'")
+        return DiagnosisLine(name, "not there", f"pip install '{name}>={least}'")
     old = _numbers(version) < _numbers(least)
-    return Line(name, version, f"pip install --upgrade '{name}>={least}'" if old else "")
+    return DiagnosisLine(name, version, f"pip install --upgrade '{name}>={least}'" if old else "")
 
 
 def _numbers(version: str) -> tuple[int, ...]:
     return tuple(int(n) for n in re.findall(r"\d+", version)[:3])
 
 
-def _device() -> Iterator[Line]:
+def _device() -> Iterator[DiagnosisLine]:
     refused = _refused_flags()
     if refused:
-        yield Line("device", refused, _unset(["XLA_FLAGS"]))
+        yield DiagnosisLine("device", refused, _unset(["XLA_FLAGS"]))
         return
     jax = importlib.import_module("jax")
     devices = ", ".join(f"{d.platform} ({d.device_kind})" for d in jax.devices())
-    yield Line("device", f"JAX computes on {devices}")
+    yield DiagnosisLine("device", f"JAX computes on {devices}")
     skin = importlib.import_module("jaxeit").load_skin("testbed")
-    yield Line("skins", f"{skin.name} is readable, {skin.protocol.readings} readings")
+    yield DiagnosisLine("skins", f"{skin.name} is readable, {skin.protocol.readings} readings")
 
 
 def _refused_flags() -> str:
@@ -131,43 +131,43 @@ def _refused_flags() -> str:
     return line.partition("] ")[2] or line
 
 
-def _threads() -> Iterator[Line]:
+def _threads() -> Iterator[DiagnosisLine]:
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    yield Line("processors", str(count), "" if count > 1 else "recording and live need two", note=True)
+    yield DiagnosisLine("processors", str(count), "" if count > 1 else "recording and live need two", note=True)
 
 
-def _priority() -> Iterator[Line]:
+def _priority() -> Iterator[DiagnosisLine]:
     refused = refusal()
     found = "refused; only jaxeit live --realtime needs it" if refused else "allowed, for jaxeit live --realtime"
-    yield Line("real-time priority", found, refused or "", note=bool(refused))
+    yield DiagnosisLine("real-time priority", found, refused or "", note=bool(refused))
 
 
-def _cache() -> Iterator[Line]:
+def _cache() -> Iterator[DiagnosisLine]:
     runtime = importlib.import_module("calib.runtime")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         folder = runtime.cache_folder()
     if folder is None:
         reason = str(caught[-1].message) if caught else "no folder for compiled programs"
-        yield Line("cache", reason, "make ~/.cache/jaxeit yours alone: chmod 700 ~/.cache/jaxeit", note=True)
+        yield DiagnosisLine("cache", reason, "make ~/.cache/jaxeit yours alone: chmod 700 ~/.cache/jaxeit", note=True)
     else:
         size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-        yield Line("cache", f"{folder}, {size / 1e6:.0f} MB")
+        yield DiagnosisLine("cache", f"{folder}, {size / 1e6:.0f} MB")
 
 
-def _disk() -> Iterator[Line]:
+def _disk() -> Iterator[DiagnosisLine]:
     here = Path.cwd()
     free = shutil.disk_usage(here).free
     remedy = "" if free > _MIN_FREE_BYTES else "free some space: an hour of 928 readings at 100 Hz takes 1.4 GB"
-    yield Line("disk", f"{free / 1e9:.1f} GB free in {here}", remedy)
+    yield DiagnosisLine("disk", f"{free / 1e9:.1f} GB free in {here}", remedy)
     if not os.access(here, os.W_OK):
-        yield Line("folder", f"{here} cannot be written to", "record into another folder", note=True)
+        yield DiagnosisLine("folder", f"{here} cannot be written to", "record into another folder", note=True)
         return
     longest = max(_sync_times(here))
     remedy = (
         "" if longest < _MAX_SYNC_TIME else "record to a local disk: a power cut loses the time of a sync in addition"
     )
-    yield Line("sync", f"{1e3 * longest:.1f} ms at most to bring a record to the disk", remedy, note=True)
+    yield DiagnosisLine("sync", f"{1e3 * longest:.1f} ms at most to bring a record to the disk", remedy, note=True)
 
 
 def _sync_times(folder: Path) -> Iterator[float]:
@@ -180,19 +180,19 @@ def _sync_times(folder: Path) -> Iterator[float]:
             yield time.monotonic() - begin
 
 
-def _ports() -> Iterator[Line]:
+def _ports() -> Iterator[DiagnosisLine]:
     ports = sorted(list_ports.comports())
     if not ports:
-        yield Line("serial ports", "none is plugged in")
+        yield DiagnosisLine("serial ports", "none is plugged in")
     for port in ports:
         mine = os.name == "nt" or os.access(port.device, os.R_OK | os.W_OK)
         remedy = "" if mine else "sudo usermod -aG dialout $USER, then log in again"
-        yield Line("serial port", f"{port.device} ({port.description})", remedy)
+        yield DiagnosisLine("serial port", f"{port.device} ({port.description})", remedy)
 
 
-def _network() -> Iterator[Line]:
+def _network() -> Iterator[DiagnosisLine]:
     with socket.create_server(("127.0.0.1", 0)) as server:
-        yield Line("loopback", f"listens on {server.getsockname()[0]}")
+        yield DiagnosisLine("loopback", f"listens on {server.getsockname()[0]}")
 
 
 _CHECKS = (_python, _packages, _device, _threads, _priority, _cache, _disk, _ports, _network)

@@ -32,7 +32,7 @@ class CommandParser(argparse.ArgumentParser):
     def refuse(self, others: Sequence[str]) -> NoReturn:
         """End with the first of the arguments that no parser took, and the nearest option."""
         word = next((word for word in others if word.startswith("-")), others[0]).partition("=")[0]
-        from jaxeit.spelling import did_you_mean  # on an error only: help answers at once
+        from jaxeit.messages.spelling import did_you_mean  # on an error only: help answers at once
 
         near = did_you_mean(word, _options(self))
         self.error(f"{word}: not known" + (f"; {near}" if near else ""))
@@ -43,7 +43,7 @@ def _nearest_choice(message: str) -> str:
     found = re.fullmatch(r"(argument .*): invalid choice: '(.*)' \(choose from (.*)\)", message)
     if not found:
         return message
-    from jaxeit.spelling import did_you_mean  # on an error only
+    from jaxeit.messages.spelling import did_you_mean  # on an error only
 
     name, word, choices = found.groups()
     known = (choice.strip("'") for choice in choices.split(", "))

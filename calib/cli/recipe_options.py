@@ -13,7 +13,7 @@ import jaxeit as je
 
 from ..calibration import Recipe
 from ..calibration.localisation.locators import LOCATORS
-from ..calibration.recipe_text import (
+from ..calibration.recipes.text import (
     AUTO,
     DEFAULT,
     FIDELITY_LEVELS,

@@ -10,8 +10,8 @@ import numpy as np
 
 from jaxeit.files import open_regular
 
-from ..calibration.application import FORCE_MAP_FORMAT, TRACKS
-from ..calibration.frame_blocks import Progress
+from ..calibration.application.frame_blocks import Progress
+from ..calibration.application.map_files import FORCE_MAP_FORMAT, TRACKS
 from ..calibration.logs.procedure import FORCE_FORMAT as LOG_FORCES
 from ..session import ArchiveReader, open_archive
 from ..session.archive import archive_format

@@ -128,7 +128,7 @@ class ForceMapTopics:
         self._write_table("tracks", time, table, "contact", [label for label, _ in TRACK_COLUMNS.values()])
 
     def _write_table(self, name: str, time: int, table: np.ndarray, rows: str, columns: Iterable[str]) -> None:
-        axes = (ros.Axis(rows, len(table)), ros.Axis(" ".join(columns), table.shape[1]))
+        axes = (ros.LabelledAxis(rows, len(table)), ros.LabelledAxis(" ".join(columns), table.shape[1]))
         self._sink.write(self._topics[name], time, ros.numbers(self._sink, table, *axes))
 
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.application import FORCE_MAP_FORMAT, TRACKS
-from ..calibration.frame_blocks import Progress
+from ..calibration.application.frame_blocks import Progress
+from ..calibration.application.map_files import FORCE_MAP_FORMAT, TRACKS
 from ..session import ArchiveReader, Session, Stream, open_archive, open_session
 from ..session.archive import archive_format
 from ..session.errors import printable, problem
@@ -224,7 +224,7 @@ Message = tuple[int, str, Callable[[], Any]]
 
 def _samples(bag: Bag, stream: Stream, topic: str) -> Iterator[Message]:
     """Times, ns since the session's epoch, and messages of all samples of a stream."""
-    axis = ros.Axis(f"{stream.variable} [{stream.unit}]", stream.channels)
+    axis = ros.LabelledAxis(f"{stream.variable} [{stream.unit}]", stream.channels)
     for start, stop, values in stream.blocks(BLOCK_BYTES):
         for time, row in zip(stream.time[start:stop].tolist(), values, strict=True):
             yield time, topic, partial(ros.numbers, bag, row, axis)

@@ -16,7 +16,7 @@ FLAGS = "std_msgs/msg/UInt16"
 FRAMES = "tf2_msgs/msg/TFMessage"
 
 
-class Axis(NamedTuple):
+class LabelledAxis(NamedTuple):
     """An axis of labelled numbers."""
 
     label: str
@@ -51,7 +51,7 @@ def wrench(sink: AbstractMessageSink, head: Any, push: float) -> Any:
     return sink.types[WRENCH](head, load)
 
 
-def numbers(sink: AbstractMessageSink, values: np.ndarray, *axes: Axis) -> Any:
+def numbers(sink: AbstractMessageSink, values: np.ndarray, *axes: LabelledAxis) -> Any:
     """Float64 numbers with a label for each axis, the last of which runs fastest."""
     kind, stride = sink.types["std_msgs/msg/MultiArrayDimension"], 1
     dims: list[Any] = []

@@ -11,7 +11,7 @@ import jaxeit as je
 from ..presses.pooled import PressData
 from .cross_validation.held_out import Folds, Split, folds_by_place, hold_out_image, leave_groups_out
 from .cross_validation.neighbourhoods import error_scale, hold_out_scaled
-from .cross_validation.selection import Choice, choose, nested_selection
+from .cross_validation.selection import ModelChoice, choose, nested_selection
 from .curves.base import AbstractCurve
 from .curves.elementary import Linear
 from .curves.fitted import FittedCurve
@@ -33,7 +33,7 @@ class PadResponse:
     ``baseline`` holds the curves of the paper's recipe beside them: `Linear`, without a field.
     """
 
-    choice: Choice
+    choice: ModelChoice
     model: PadModel
     baseline: FittedCurve
     without: Mapping[int, PadModel]
@@ -110,7 +110,7 @@ def require_every_pad_pressed(skin: je.Skin, data: PressData) -> None:
             )
 
 
-def _baseline(choice: Choice) -> tuple[AbstractCurve, AbstractField | None]:
+def _baseline(choice: ModelChoice) -> tuple[AbstractCurve, AbstractField | None]:
     """Curve and field of the paper: a straight line, and none."""
     return (choice.curve, None) if isinstance(choice.curve, Linear) else (Linear(), None)
 

@@ -21,7 +21,7 @@ from jaxeit.skin import skin_hash
 from ..batch.digests import digest
 from ..batch.random_frames import write_training_frames
 from ..bench import BenchError, FrameSet, TrainingFrames, open_training_frames
-from ..bench.scene_frames import SHARD_FRAMES
+from ..bench.training.scene_frames import SHARD_FRAMES
 from .inputs import Compression, Inputs, calibrated_forces, fit_compression, inputs_of, without_an_electrode
 from .quality import figures_of, fit_temperature
 from .scenes import noise_of, scenes_for, training_bench

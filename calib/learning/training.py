@@ -48,7 +48,7 @@ class Examples(NamedTuple):
     known: Float[Array, "n 4"]
 
 
-class State(NamedTuple):
+class TrainingState(NamedTuple):
     """Weights, what the optimiser keeps, and the number of epochs done."""
 
     network: eqx.nn.MLP
@@ -82,7 +82,7 @@ def train(
     steps = len(examples.kind) // BATCH
     optimiser = optax.adamw(optax.cosine_decay_schedule(RATE, epochs * steps), weight_decay=DECAY)
     network = new_network(examples.whole.shape[1] + 2 * examples.pads.shape[1], key)
-    state = State(network, optimiser.init(eqx.filter(network, eqx.is_array)), jnp.asarray(0))
+    state = TrainingState(network, optimiser.init(eqx.filter(network, eqx.is_array)), jnp.asarray(0))
     if checkpoint.is_file():
         state = _read(checkpoint, state)
     run = eqx.filter_jit(epoch)
@@ -97,7 +97,7 @@ def train(
     return state.network
 
 
-def _write(checkpoint: Path, state: State) -> None:
+def _write(checkpoint: Path, state: TrainingState) -> None:
     """Write a state, with the digest that tells whether it is whole."""
     buffer = io.BytesIO()
     eqx.tree_serialise_leaves(buffer, state)
@@ -105,23 +105,23 @@ def _write(checkpoint: Path, state: State) -> None:
         new.write_bytes(hashlib.sha256(buffer.getvalue()).digest() + buffer.getvalue())
 
 
-def _read(checkpoint: Path, like: State) -> State:
+def _read(checkpoint: Path, like: TrainingState) -> TrainingState:
     """Read what `_write` wrote of a state of these shapes."""
     whole = checkpoint.read_bytes()
     size = hashlib.sha256().digest_size
     if whole[:size] != hashlib.sha256(whole[size:]).digest():
         raise BenchError(f"{checkpoint} is damaged; remove it, and training begins anew on the scenes beside it")
-    state: State = eqx.tree_deserialise_leaves(io.BytesIO(whole[size:]), like)
+    state: TrainingState = eqx.tree_deserialise_leaves(io.BytesIO(whole[size:]), like)
     return state
 
 
 def epoch(
-    state: State,
+    state: TrainingState,
     optimiser: optax.GradientTransformation,
     examples: Examples,
     tolerance: Float[Array, " 30"],
     key: Key[Array, ""],
-) -> tuple[State, Float[Array, ""]]:
+) -> tuple[TrainingState, Float[Array, ""]]:
     """One pass over all examples in a drawn order, and its mean loss."""
     weights, rest = eqx.partition(state.network, eqx.is_array)
     count = len(examples.kind) // BATCH
@@ -138,7 +138,7 @@ def epoch(
 
     keys = jax.random.split(jax.random.fold_in(key, 1), count)
     (weights, kept), losses = jax.lax.scan(step, (weights, state.optimiser), (orders, keys))
-    return State(eqx.combine(weights, rest), kept, state.epochs + 1), jnp.mean(losses)
+    return TrainingState(eqx.combine(weights, rest), kept, state.epochs + 1), jnp.mean(losses)
 
 
 def drawn_inputs(batch: Examples, key: Key[Array, ""]) -> Float[Array, "n i"]:

@@ -3,10 +3,10 @@
 from . import bridges as bridges
 from .engine import Engine as Engine, ReceivedFrame as ReceivedFrame
 from .loop import LiveControl as LiveControl, LiveError as LiveError, LiveSettings as LiveSettings, run_live as run_live
-from .presentation import Presentation as Presentation, present as present
 from .results import (
     FrameResult as FrameResult,
     KindEstimate as KindEstimate,
     LogResult as LogResult,
     TouchEstimates as TouchEstimates,
 )
+from .views.presentation import Presentation as Presentation, present as present

@@ -21,8 +21,8 @@ from jaxtyping import Array
 import jaxeit as je
 from jaxeit.tracking import LearnedLayer, Track
 
+from ..calibration.application.force_maps import ForceModel, filled, force_model, fused, is_loaded
 from ..calibration.calibration import Calibration
-from ..calibration.force_maps import ForceModel, filled, force_model, fused, is_loaded
 from ..calibration.localisation.ellipses import placement_covariance
 from ..calibration.localisation.locators import ContactLocator
 from ..check.placement import noted

@@ -17,8 +17,8 @@ import numpy as np
 
 from jaxeit.tracking import LearnedLayer
 
+from ..calibration.application.force_maps import ForceModel
 from ..calibration.calibration import Calibration
-from ..calibration.force_maps import ForceModel
 from ..calibration.recalibration.changes import Evidence, Recalibration
 from ..calibration.recalibration.ordinary_use import loaded_pressures
 from ..calibration.recalibration.press_noise import press_noise

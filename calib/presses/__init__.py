@@ -39,11 +39,11 @@ from .corrections import (
     PreOnly,
     TwoSided,
 )
-from .detection import DetectionLimits, find_presses
 from .pooled import PooledPresses, PressData, pool_presses
 from .streams import PressError
 from .table import PressMeasurements, Processing, measure
-from .windows import WindowLengths
+from .timing.detection import DetectionLimits, find_presses
+from .timing.windows import WindowLengths
 
 __all__ = [
     "BASELINES",

@@ -8,8 +8,8 @@ import numpy as np
 from ..session.units import SECOND
 from .corrections import AbstractBaseline, AbstractCorrection, TwoSided, WindowMeans, correct, window_means
 from .streams import READ_AHEAD_BYTES, ReadableStream, index_ranges
-from .times import PressColumns
-from .windows import PressWindows
+from .timing.times import PressColumns
+from .timing.windows import PressWindows
 
 FILTER_MARGIN = SECOND // 2  # ns read beyond the outermost windows, so that edge effects of filters stay outside them
 AVERAGED_WINDOWS = ("hold", "rest_before", "rest_after")

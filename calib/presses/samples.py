@@ -8,8 +8,8 @@ import numpy as np
 from .corrections import AbstractBaseline, AbstractCorrection, TwoSided, masked_product
 from .means import read_press
 from .streams import ReadableStream, ReadAhead, finite_mean, index_ranges, resample
-from .times import PressColumns
-from .windows import PressWindows
+from .timing.times import PressColumns
+from .timing.windows import PressWindows
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 import jaxeit as je
-from jaxeit.kinds import require_kind
+from jaxeit.messages.kinds import require_kind
 
 from ..session import PressTable, Session, SessionError, Stream
 from ..session.mixing import same_scan
@@ -20,13 +20,13 @@ from .corrections import (
     WindowMeans,
     sample_rate,
 )
-from .detection import find_presses
 from .means import PressMeans, hold_positions, press_means
 from .samples import PressSamples, press_samples
 from .skins import rests_on_pads
 from .streams import finite_mean, index_ranges, recording_end
-from .times import reject
-from .windows import PressWindows, WindowLengths, press_windows, reject_without_samples
+from .timing.detection import find_presses
+from .timing.times import reject
+from .timing.windows import PressWindows, WindowLengths, press_windows, reject_without_samples
 
 DEFAULT_CUTOFF = 50.0  # Hz, the low-pass of the paper
 

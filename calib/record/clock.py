@@ -55,7 +55,7 @@ def _rounded(ns: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Line:
+class DelayLine:
     """Delay beyond nominal device time: ``level`` (ns) at ``middle`` (ns), growing by ``skew`` (ns per ns)."""
 
     middle: float
@@ -67,7 +67,7 @@ class Line:
         return self.level + self.skew * (x - self.middle)
 
 
-def supporting_line(x: np.ndarray, y: np.ndarray, middle: float, usual_skew: float = 0.0) -> Line:
+def supporting_line(x: np.ndarray, y: np.ndarray, middle: float, usual_skew: float = 0.0) -> DelayLine:
     """The line below all points of a lower hull that is closest to them at `middle`.
 
     `usual_skew` is used where the points span too short a time to determine the skew.
@@ -77,7 +77,7 @@ def supporting_line(x: np.ndarray, y: np.ndarray, middle: float, usual_skew: flo
         edge = int(np.clip(np.searchsorted(x, middle), 1, len(x) - 1))
         skew = float((y[edge] - y[edge - 1]) / (x[edge] - x[edge - 1]))
         skew = min(max(skew, -MAX_SKEW), MAX_SKEW)
-    return Line(middle, float(np.min(y - skew * (x - middle))), skew)
+    return DelayLine(middle, float(np.min(y - skew * (x - middle))), skew)
 
 
 Points = tuple[np.ndarray, np.ndarray]
@@ -95,7 +95,7 @@ class _PointSegment:
     waiting: list[Points] = field(default_factory=list)
     span: float = 0.0  # from the first point to the last
     lowest: float = 0.0
-    line: Line | None = None
+    line: DelayLine | None = None
     line_due: float = SECOND
     lateness: float = 0.0  # mean delay above the line
 
@@ -136,7 +136,7 @@ class _PointSegment:
         """Lower hulls of ten seconds each; the last one may not be full."""
         return [*self.blocks, self._open_block()]
 
-    def latest(self) -> Line | None:
+    def latest(self) -> DelayLine | None:
         """The line of the last minute of points so far; None while the rate is not determined."""
         if self.span < MIN_RATE_SPAN:
             return None
@@ -256,7 +256,7 @@ class DeviceClock:
         """Estimate when frames of the present segment were taken, from the points so far, int64 ns."""
         now = self._segments[-1]
         x = (unwrapped - now.ticks) * self.tick_ns
-        line = now.line or Line(0.0, now.lowest, 0.0)
+        line = now.line or DelayLine(0.0, now.lowest, 0.0)
         return now.host + _rounded(x + line.at(x))
 
     def fit(self) -> "ClockFit":
@@ -365,7 +365,7 @@ def is_wrong_tick(ratio: float, elapsed: float) -> bool:
     return max(ratio, 1 / ratio) - 1 > max(tolerance, MAX_SKEW)
 
 
-def _lines(segment: _PointSegment, usual_skew: float) -> list[Line]:
+def _lines(segment: _PointSegment, usual_skew: float) -> list[DelayLine]:
     """Lines of one minute every half minute; a single line for a shorter segment."""
     count = max(1, int((segment.span - FIT_WINDOW) // FIT_STEP) + 1)
     blocks = segment.all_blocks()
@@ -380,7 +380,7 @@ def _lines(segment: _PointSegment, usual_skew: float) -> list[Line]:
     return lines
 
 
-def _fitted_segment(segment: _PointSegment, lines: list[Line], tick_ns: float) -> ClockSegment:
+def _fitted_segment(segment: _PointSegment, lines: list[DelayLine], tick_ns: float) -> ClockSegment:
     """Knots at the middles of the lines, rounded to whole ticks."""
     ticks = np.unique(np.rint([line.middle / tick_ns for line in lines]).astype(np.int64))
     x = ticks * tick_ns

@@ -34,7 +34,7 @@ class PlanError(ValueError):
 
 
 @dataclass(frozen=True)
-class StreamKind:
+class StreamProperties:
     """Properties of streams of one name: variable, unit, wire number, largest possible magnitude in SI."""
 
     variable: str
@@ -43,13 +43,13 @@ class StreamKind:
     limit: float
 
 
-STREAM_KINDS: Mapping[str, StreamKind] = {
-    "eit": StreamKind("voltage", "V", 1, 1e3),
-    "pressure": StreamKind("pressure", "Pa", 2, 1e7),
-    "force": StreamKind("force", "N", 3, 1e6),
-    "stage": StreamKind("position", "m", 4, 1e2),
-    "temperature": StreamKind("temperature", "K", 5, 1e4),
-    "barometer": StreamKind("pressure", "Pa", 6, 1e7),
+STREAM_KINDS: Mapping[str, StreamProperties] = {
+    "eit": StreamProperties("voltage", "V", 1, 1e3),
+    "pressure": StreamProperties("pressure", "Pa", 2, 1e7),
+    "force": StreamProperties("force", "N", 3, 1e6),
+    "stage": StreamProperties("position", "m", 4, 1e2),
+    "temperature": StreamProperties("temperature", "K", 5, 1e4),
+    "barometer": StreamProperties("pressure", "Pa", 6, 1e7),
 }
 
 
@@ -103,7 +103,7 @@ class StreamPlan:
         _check_texts(self)
 
     @property
-    def kind(self) -> StreamKind:
+    def kind(self) -> StreamProperties:
         """Variable, unit and limit of its values."""
         return STREAM_KINDS[self.name]
 

@@ -9,7 +9,7 @@ from typing import Any, overload
 import numpy as np
 
 import jaxeit as je
-from jaxeit.kinds import require_kind
+from jaxeit.messages.kinds import require_kind
 
 from ..calibration.calibration import Calibration
 from ..calibration.evaluation import FORCE_METHODS, FORCE_THIRDS, Evaluation, localisation_errors
@@ -22,7 +22,7 @@ from .figures.parts import require_matplotlib
 from .figures.presses import ESTIMATOR_MEANING
 from .html_parts import PAGE, PLUS_MINUS, STYLE, html_table, number_text, significant_text, with_error
 from .log_document import write_log_report
-from .pictures import Picture, calibration_pictures
+from .pictures import PictureSection, calibration_pictures
 
 _NONE: Mapping[str, Any] = MappingProxyType({})
 
@@ -97,7 +97,7 @@ def _write(path: Path, data: bytes) -> None:
 # --- the page ------------------------------------------------------------------------------------------------------
 
 
-def _page(calibration: Calibration, evaluations: Mapping[str, Evaluation], pictures: Iterable[Picture]) -> str:
+def _page(calibration: Calibration, evaluations: Mapping[str, Evaluation], pictures: Iterable[PictureSection]) -> str:
     mark = "SIMULATED: " if calibration.simulated else ""
     title = escape(f"{mark}Calibration of the skin {calibration.skin.name}")
     parts = [

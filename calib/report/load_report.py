@@ -9,7 +9,7 @@ from jaxeit.contacts import LoadKind
 
 from ..calibration.localisation.load_windows import left_by_fits
 from .figures.force_series import SERIES
-from .figures.panels import WIDE_PANEL_WIDTH, Panel, chart_axes, panel
+from .figures.panels import WIDE_PANEL_WIDTH, FigurePanel, chart_axes, panel
 from .figures.parts import MM
 from .html_parts import html_table, number_text
 
@@ -52,7 +52,7 @@ def load_parts(windows: Windows, learned: Sequence[str] = (), *, simulated: bool
     ]
 
 
-def panel_of_kinds(windows: Windows, *, simulated: bool) -> Panel:
+def panel_of_kinds(windows: Windows, *, simulated: bool) -> FigurePanel:
     """Probabilities of the kinds over time, one above the other."""
     figure, axes = chart_axes(simulated=simulated, width=WIDE_PANEL_WIDTH, height=0.6 * WIDE_PANEL_WIDTH)
     begin, end = windows["time"].T / 1e9

@@ -15,12 +15,9 @@ from .captions import (
     about_maps,
     about_sensitivity,
 )
-from .figures.contact_layer import about_layer, layer_figure, layer_panels
-from .figures.curved_sheet import curved_figure, curved_panels
-from .figures.electrodes import about_electrodes, electrodes_figure, electrodes_panels
 from .figures.maps import ExampleMaps, maps_figure
 from .figures.pads import curves_figure, gain_figure, has_loops, loops_figure
-from .figures.panels import Panel
+from .figures.panels import FigurePanel
 from .figures.parts import png
 from .figures.press_panels import (
     curve_panels,
@@ -31,6 +28,9 @@ from .figures.press_panels import (
     sensitivity_panels,
 )
 from .figures.presses import localisation_figure, sensitivity_figure
+from .figures.skin.contact_layer import about_layer, layer_figure, layer_panels
+from .figures.skin.curved_sheet import curved_figure, curved_panels
+from .figures.skin.electrodes import about_electrodes, electrodes_figure, electrodes_panels
 from .html_parts import html_table
 
 # The image's estimator nearest to the paper's figure, and the one that the correction by location goes by.
@@ -47,7 +47,7 @@ CONTACT_COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Picture:
+class PictureSection:
     """A section of the page, and its PNG file.
 
     | field  | meaning                                                                |
@@ -66,7 +66,7 @@ class Picture:
     data: bytes
     alt: str
     caption: str
-    panels: Sequence[Panel]
+    panels: Sequence[FigurePanel]
     rows: Sequence[Sequence[str]] = field(default=())
 
     def html(self) -> str:
@@ -79,7 +79,7 @@ class Picture:
         return f"<h2>{escape(self.title)}</h2><figure>{shown}{caption}</figure>{table}"
 
 
-def calibration_pictures(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> list[Picture]:
+def calibration_pictures(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> list[PictureSection]:
     """All pictures of a calibration, in the order of the page.
 
     Raises:
@@ -89,19 +89,19 @@ def calibration_pictures(calibration: Calibration, evaluations: Mapping[str, Eva
     curves = png(curves_figure(calibration, evaluations))
     about = about_curves(calibration, evaluations)
     panels = curve_panels(calibration, evaluations)
-    pictures.append(Picture("curves", "Curves and force errors", curves, *about, panels))
+    pictures.append(PictureSection("curves", "Curves and force errors", curves, *about, panels))
     if has_loops(calibration):
         loops, about = png(loops_figure(calibration)), about_loops(calibration)
-        pictures.append(Picture("loops", "Hysteresis", loops, *about, loop_panels(calibration)))
+        pictures.append(PictureSection("loops", "Hysteresis", loops, *about, loop_panels(calibration)))
     if calibration.field is not None:
         gain, about = png(gain_figure(calibration)), about_gain(calibration.field)
-        pictures.append(Picture("gain", "Gain by location", gain, *about, gain_panels(calibration)))
+        pictures.append(PictureSection("gain", "Gain by location", gain, *about, gain_panels(calibration)))
     if calibration.layer is not None:
         maps, about = png(layer_figure(calibration)), about_layer(calibration.layer, calibration.contact_law)
-        pictures.append(Picture("layer", "Contact layer", maps, *about, layer_panels(calibration)))
+        pictures.append(PictureSection("layer", "Contact layer", maps, *about, layer_panels(calibration)))
     if calibration.electrodes is not None:
         shifts, about = png(electrodes_figure(calibration)), about_electrodes(calibration)
-        pictures.append(Picture("electrodes", "Electrodes", shifts, *about, electrodes_panels(calibration)))
+        pictures.append(PictureSection("electrodes", "Electrodes", shifts, *about, electrodes_panels(calibration)))
     return pictures
 
 
@@ -110,23 +110,23 @@ def _estimators(calibration: Calibration) -> list[str]:
     return [name for name in SHOWN_ESTIMATORS if name in known] or list(known)[:1]
 
 
-def _examples(calibration: Calibration) -> list[Picture]:
+def _examples(calibration: Calibration) -> list[PictureSection]:
     """Maps of some presses, and those on a curved sheet in space."""
     if calibration.examples is None:
         return []
     maps = ExampleMaps(calibration)
     about = about_maps(calibration.examples, maps.contacts.estimator, maps.larger)
     title = "Images, force maps and contacts of some presses"
-    pictures = [Picture("maps", title, png(maps_figure(maps)), *about, map_panels(maps), maps.rows())]
+    pictures = [PictureSection("maps", title, png(maps_figure(maps)), *about, map_panels(maps), maps.rows())]
     if calibration.skin.surface is not None:
         estimator = _estimators(calibration)[-1]
         curved = png(curved_figure(calibration, estimator))
         panels = curved_panels(calibration, estimator)
-        pictures.append(Picture("curved", "On the curved sheet", curved, *about_curved(estimator), panels))
+        pictures.append(PictureSection("curved", "On the curved sheet", curved, *about_curved(estimator), panels))
     return pictures
 
 
-def _places(calibration: Calibration) -> list[Picture]:
+def _places(calibration: Calibration) -> list[PictureSection]:
     """Places and sensitivity."""
     found, skin, simulated = calibration.evaluation, calibration.skin, calibration.simulated
     estimators = _estimators(calibration)
@@ -135,6 +135,6 @@ def _places(calibration: Calibration) -> list[Picture]:
     sensitivity = png(sensitivity_figure(found, skin, simulated=simulated))
     maps = sensitivity_panels(found, skin, simulated=simulated)
     return [
-        Picture("localisation", "Localisation", places, *about_localisation(found, estimators), panels),
-        Picture("sensitivity", "Sensitivity over the sheet", sensitivity, *about_sensitivity(found), maps),
+        PictureSection("localisation", "Localisation", places, *about_localisation(found, estimators), panels),
+        PictureSection("sensitivity", "Sensitivity over the sheet", sensitivity, *about_sensitivity(found), maps),
     ]

@@ -9,14 +9,14 @@ import numpy as np
 
 import jaxeit as je
 
-from ..calibration.application import FORCE_MAP_FORMAT, LOADS, TRACKS
+from ..calibration.application.map_files import FORCE_MAP_FORMAT, LOADS, TRACKS
 from ..calibration.localisation import load_windows
 from ..calibration.localisation.contact_tracks import TRACK_ARRAYS, Rows
 from ..calibration.localisation.ellipses import INSIDE_90, confidence_ellipse
 from ..session import open_archive, replacing
 from .example_contacts import ELLIPSE_MAGNIFICATION
 from .figures.force_series import SERIES
-from .figures.panels import WIDE_PANEL_WIDTH, Panel, chart_axes, panel, sheet_axes
+from .figures.panels import WIDE_PANEL_WIDTH, FigurePanel, chart_axes, panel, sheet_axes
 from .figures.parts import MM, require_matplotlib
 from .html_parts import PAGE, STYLE, html_table, number_text, with_error
 from .load_report import load_parts
@@ -102,7 +102,7 @@ def by_number(rows: Rows) -> dict[int, Rows]:
     return {number: {name: part[rows["number"] == number] for name, part in rows.items()} for number in numbers}
 
 
-def tracks_panels(rows: Rows, skin: je.Skin, *, simulated: bool = False) -> list[Panel]:
+def tracks_panels(rows: Rows, skin: je.Skin, *, simulated: bool = False) -> list[FigurePanel]:
     """Paths of contacts over the sheet, with ellipses of 90 %, and their forces over time.
 
     Args:

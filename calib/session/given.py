@@ -7,7 +7,7 @@ from types import NoneType
 from typing import Any
 
 import jaxeit as je
-from jaxeit.kinds import require_kind
+from jaxeit.messages.kinds import require_kind
 
 from .errors import SessionError
 from .reader import Session

@@ -191,7 +191,9 @@ def _step(
         pattern = model.pattern if stream is fx.StreamKind.EIT and model.mixing is None else model.pattern[:0]
         key = jax.random.fold_in(jax.random.fold_in(state.key, purpose), state.number)
         still = jnp.zeros(1, model.dtype)
-        series, after = fx.history(mine, values[None], before, fx.Line(key, skin.interval, still, still, pattern))
+        series, after = fx.history(
+            mine, values[None], before, fx.HistoryInputs(key, skin.interval, still, still, pattern)
+        )
         return series[0], after
 
     felt, material = continued(fx.AbstractMemoryEffect, pressure, state.material, 0)

@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float
 
 from .._compile import full_precision, require_known, verb
 from ..imaging.inputs import InverseError, real_numbers
+from ..imaging.readings.whitening import Whitened, whitened_readings
 from ..imaging.untouched import background_of
-from ..imaging.whitening import Whitened, whitened_readings
-from ..kinds import require_kind
+from ..messages.kinds import require_kind
 from ..model.bases import Elements
 from ..model.discretisation import Model, require_model
 from ..model.sensitivity import pair_jacobian

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._compile import require_known, verb
 from ..imaging.inputs import InverseError, require_real
-from ..imaging.whitening import Whitening
+from ..imaging.readings.whitening import Whitening
 from ..least_squares import ImplicitStep
 from ..least_squares.searches import normal_inverse
 from ..model.discretisation import Model

@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._compile import by_platform, sequential_on_cpu, usually, verb
 from ..imaging.inputs import require_frames
-from ..imaging.missing import gap_of, missing_information
-from ..imaging.whitening import Whitening
+from ..imaging.readings.missing import gap_of, missing_information
+from ..imaging.readings.whitening import Whitening
 from .bump_responses import Responses
 from .fit import ContactFit, FitState, FrameResponse, contact_rows
 from .result import ContactResult, Contacts
@@ -37,7 +37,7 @@ BATCH_SIZE = 256
 MAX_DEVIATIONS = 4
 
 
-class Frame(NamedTuple):
+class WhitenedFrame(NamedTuple):
     """Whitened readings of a frame.
 
     | meaning                                                   | shape  |
@@ -153,26 +153,28 @@ class ContactFinder(eqx.Module):
         found = jax.lax.stop_gradient(search).select()  # derivatives: see `FrameResponse.linearise`
         return self._contacts(bumps, frame, found, jnp.any(finite))
 
-    def compressed(self, dv: Float[Array, " readings"]) -> tuple[Frame, Bool[Array, ""]]:
+    def compressed(self, dv: Float[Array, " readings"]) -> tuple[WhitenedFrame, Bool[Array, ""]]:
         """Whiten a frame, (readings,) V; and whether no reading that is used is missing (NaN)."""
         channels = self.whitening.channels
         whole = jnp.all((jnp.isfinite(dv) & channels) == channels)
         frame = usually(whole, ContactFinder._complete_frame, ContactFinder._incomplete_frame, self, dv)
         return frame, whole
 
-    def _complete_frame(self, dv: Float[Array, " readings"]) -> Frame:
+    def _complete_frame(self, dv: Float[Array, " readings"]) -> WhitenedFrame:
         sums = self.whitening.sums(dv)
         y, complement = self.compress @ sums, self.rest @ sums
         dimension = self.compress.shape[0] + self.rest.shape[0]
-        return Frame(y, complement @ complement, jnp.asarray(dimension, y.dtype), self.root)
+        return WhitenedFrame(y, complement @ complement, jnp.asarray(dimension, y.dtype), self.root)
 
-    def _incomplete_frame(self, dv: Float[Array, " readings"]) -> Frame:
+    def _incomplete_frame(self, dv: Float[Array, " readings"]) -> WhitenedFrame:
         lost = missing_information(self.whitening, dv)
         total = jnp.concatenate([self.compress, self.rest])
         signal, both = (gap_of(matrix, lost) for matrix in (self.compress, total))
-        return Frame(signal.y, jnp.maximum(both.y @ both.y - signal.y @ signal.y, 0), both.rank, signal.root)
+        return WhitenedFrame(signal.y, jnp.maximum(both.y @ both.y - signal.y @ signal.y, 0), both.rank, signal.root)
 
-    def _contacts(self, bumps: FrameResponse, frame: Frame, found: Selection, readable: Bool[Array, ""]) -> Contacts:
+    def _contacts(
+        self, bumps: FrameResponse, frame: WhitenedFrame, found: Selection, readable: Bool[Array, ""]
+    ) -> Contacts:
         """The selected contacts as results, the strongest first."""
         present = jnp.arange(self.most) < found.number
         theta, covariance = bumps.linearise(frame.y, contact_rows(found.fit.flat), present)

@@ -53,7 +53,7 @@ Example: a recorded pressure
         effects.Noise(std=5.0, stream=effects.StreamKind.PRESSURE),
         effects.Quantisation(step=10.5, stream=effects.StreamKind.PRESSURE),
     )
-    line = effects.Line(
+    inputs = effects.HistoryInputs(
         key=jax.random.key(0),
         interval=jnp.array(0.01),
         temperature=jnp.zeros(400),
@@ -61,7 +61,7 @@ Example: a recorded pressure
         pattern=jnp.zeros((0, 4), int),
     )
     recorded, state = effects.history(
-        air + readout, held, effects.history_start(air + readout, rest), line
+        air + readout, held, effects.history_start(air + readout, rest), inputs
     )
     print(recorded[-1])  # Pa; the next block of samples starts with `state`
 
@@ -77,7 +77,7 @@ Example: what each readout effect makes of the frames of an untouched skin
     )
     resting = je.forward(model)  # V
     frames = jnp.tile(resting, (400, 1))
-    scan = line._replace(pattern=model.pattern)
+    scan = inputs._replace(pattern=model.pattern)
     for kind in kinds:
         series, _ = effects.history((kind,), frames, effects.history_start((kind,), resting), scan)
         print(f"{type(kind).__name__}: {1e6 * jnp.std(series - frames):.1f} uV")
@@ -85,10 +85,10 @@ Example: what each readout effect makes of the frames of an untouched skin
 Example: memory of the material, and a load cell
     load = jnp.where(jnp.arange(400)[:, None] < 200, 10.0, 5.0)  # N of one contact
     memory = (effects.Creep(rate=0.05), effects.Hysteresis(loop=0.1))
-    felt, _ = effects.history(memory, load, effects.history_start(memory, jnp.zeros(1)), line)
+    felt, _ = effects.history(memory, load, effects.history_start(memory, jnp.zeros(1)), inputs)
     print(felt[199], felt[-1])  # N: more than acts, after a while and on the way down
     cell = effects.LoadCellError(nonlinearity=1e-3)
-    print(effects.history((cell,), load, effects.history_start((cell,), jnp.zeros(1)), line)[0][0])  # N
+    print(effects.history((cell,), load, effects.history_start((cell,), jnp.zeros(1)), inputs)[0][0])  # N
 """
 
 from ..registry import Registry
@@ -109,8 +109,8 @@ from .base import (
     AbstractTerminalEffect,
     Circuit,
     EffectError,
+    HistoryInputs,
     Indenter,
-    Line,
     Packets,
     Path,
     Sheet,
@@ -197,12 +197,12 @@ __all__ = [
     "GainError",
     "GasLaw",
     "GasRelaxation",
+    "HistoryInputs",
     "HomogenisedIslands",
     "Hysteresis",
     "IndentationSpreading",
     "Indenter",
     "IntermittentElectrode",
-    "Line",
     "LoadCellError",
     "LoadSpreading",
     "MultiplicativeNoise",

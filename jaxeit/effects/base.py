@@ -105,7 +105,7 @@ class Circuit(NamedTuple):
     current: Float[Array, ""]
 
 
-class Line(NamedTuple):
+class HistoryInputs(NamedTuple):
     """The inputs of a history effect besides its series.
 
     | meaning                                                       | shape         | unit |
@@ -242,7 +242,7 @@ class AbstractHistoryEffect(AbstractEffect):
         return ()
 
     @abstractmethod
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
         """The block (time, channels) after this effect, from that before it, and the state for the next block."""
 
 
@@ -430,13 +430,13 @@ def history_start(effects: Iterable[AbstractHistoryEffect], first: Float[Array, 
 
 
 def history(
-    effects: Iterable[AbstractHistoryEffect], series: Series, states: tuple[State, ...], line: Line
+    effects: Iterable[AbstractHistoryEffect], series: Series, states: tuple[State, ...], inputs: HistoryInputs
 ) -> tuple[Series, tuple[State, ...]]:
     """A block (time, channels) of a series after these effects, in the order given; their states for the next block."""
     after = []
     effects = tuple(effects)
-    for effect, state, key in zip(effects, states, keys(effects, line.key), strict=True):
+    for effect, state, key in zip(effects, states, keys(effects, inputs.key), strict=True):
         with jax.named_scope(type(effect).__name__):
-            series, state = effect(series, state, line._replace(key=key))
+            series, state = effect(series, state, inputs._replace(key=key))
         after.append(state)
     return series, tuple(after)

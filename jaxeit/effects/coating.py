@@ -12,7 +12,7 @@ class ContinuousCoating(AbstractCoatEffect):
     """The metal is one sheet, not islands, and connects pressed places that are far apart.
 
     Sheet and metal, with potentials u and m, exchange current under pressure
-    (`jaxeit.model.metal_sheet`):
+    (`jaxeit.model.matrix.metal_sheet`):
 
         -div(sigma grad u) + g (u - m) = 0,  -div(grad m) / R_m + g (m - u) = 0,
         g = f / rho,  rho = rho_r (p / p_r)^-n.

@@ -14,7 +14,7 @@ from .base import (
     MOST_STD,
     AbstractMemoryEffect,
     AbstractSheetEffect,
-    Line,
+    HistoryInputs,
     Series,
     Sheet,
     State,
@@ -219,13 +219,13 @@ class Creep(AbstractMemoryEffect):
     def start(self, first: Float[Array, " channels"]) -> State:
         return first, jnp.zeros_like(first)
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
         def older(state: tuple[Array, Array], load: Array) -> tuple[tuple[Array, Array], Array]:
             before, age = state
             grown = load > before
             # the share of the load that was present before
             old = jnp.where(grown, before, 1.0) / jnp.where(grown, load, 1.0)
-            age = jnp.where(load > 0, old * (age + line.interval.astype(age.dtype)), 0.0)
+            age = jnp.where(load > 0, old * (age + inputs.interval.astype(age.dtype)), 0.0)
             return (load, age), age
 
         state, age = jax.lax.scan(older, state, series)
@@ -255,7 +255,7 @@ class Hysteresis(AbstractMemoryEffect):
     def start(self, first: Float[Array, " channels"]) -> State:
         return _logarithm(first), jnp.zeros((PLAY_OPERATORS, *first.shape), first.dtype)
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
         widths = jnp.log(self.reach) * jnp.arange(1, PLAY_OPERATORS + 1).astype(series.dtype)[:, None] / PLAY_OPERATORS
 
         def play(state: tuple[Array, Array], log: Array) -> tuple[tuple[Array, Array], Array]:

@@ -12,7 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, DTypeLike, Float, Int
 
-from .base import AbstractPadEffect, AbstractPneumaticEffect, Line, Series, State, metres, parameter, require_relation
+from .base import (
+    AbstractPadEffect,
+    AbstractPneumaticEffect,
+    HistoryInputs,
+    Series,
+    State,
+    metres,
+    parameter,
+    require_relation,
+)
 from .random import own_normal
 
 
@@ -48,7 +57,7 @@ class PadCrosstalk(AbstractPneumaticEffect):
 
     fraction: Float[Array, ""] = parameter(0.02, most=1.0)
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
         others = (series.sum(1, keepdims=True) - series) / max(series.shape[1] - 1, 1)
         return series + self.fraction * others, state
 
@@ -80,10 +89,10 @@ class TpuRelaxation(AbstractPneumaticEffect):
     def start(self, first: Float[Array, " channels"]) -> State:
         return first, jnp.zeros((self.times.size, first.size), first.dtype)
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
         excess = (1 - self.gas_share) * self.shares / (1 - self.shares.sum())
         weight = excess.astype(series.dtype)[:, None]
-        keep, gain = (part[:, None] for part in _relaxation(line.interval, self.times, series.dtype))
+        keep, gain = (part[:, None] for part in _relaxation(inputs.interval, self.times, series.dtype))
 
         def step(state: tuple[Array, Array], ideal: Array) -> tuple[tuple[Array, Array], Array]:
             before, h = state
@@ -116,7 +125,7 @@ class GasLaw(AbstractPneumaticEffect):
     compliance: Float[Array, ""] = parameter(7e-10, finite=False)
     pressure: Float[Array, ""] = parameter(101325.0, above=0.0)
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
         structure = 1 / (1 + self.compliance * self.pressure / self.volume)
         q = series / self.pressure
         y = 2 * q / (1 + q + jnp.sqrt((1 + q) ** 2 - 4 * structure * q))
@@ -146,9 +155,9 @@ class GasRelaxation(AbstractPneumaticEffect):
     def start(self, first: Float[Array, " channels"]) -> State:
         return first, jnp.zeros_like(first)
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
         stiffer = 1 + self.gas_share * (self.heat_ratio - 1)
-        warmth, state = _transient(series, state, line.interval, stiffer * self.time)
+        warmth, state = _transient(series, state, inputs.interval, stiffer * self.time)
         return series + (1 - self.gas_share) * (self.heat_ratio - 1) / stiffer * warmth, state
 
 
@@ -166,8 +175,8 @@ class PadTemperature(AbstractPneumaticEffect):
     sensitivity: Float[Array, ""] = parameter(346.0)
     barometer: Float[Array, ""] = parameter(1.0)
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
-        shift = self.sensitivity * line.temperature - self.barometer * line.barometer
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
+        shift = self.sensitivity * inputs.temperature - self.barometer * inputs.barometer
         return series + shift.astype(series.dtype)[:, None], state
 
 
@@ -188,8 +197,8 @@ class PadLeak(AbstractPneumaticEffect):
     def start(self, first: Float[Array, " channels"]) -> State:
         return first, first
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
-        return _transient(series, state, line.interval, self.time)
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
+        return _transient(series, state, inputs.interval, self.time)
 
 
 class SensorError(AbstractPneumaticEffect):
@@ -208,7 +217,7 @@ class SensorError(AbstractPneumaticEffect):
     span: Float[Array, ""] = parameter(0.0025)
     seed: Int[Array, ""] = parameter(0)
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
         a, b = own_normal(self, self.seed, (2, series.shape[1]), series.dtype)
         return self.offset * a + (1 + self.span * b) * series, state
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from .base import (
     AbstractReadoutEffect,
     AbstractScanEffect,
-    Line,
+    HistoryInputs,
     Series,
     State,
     StreamKind,
@@ -70,11 +70,11 @@ class IntermittentElectrode(AbstractReadoutEffect):
     def start(self, first: Float[Array, " channels"]) -> State:
         return jnp.zeros((), bool)
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
-        chance, floating = jax.random.split(line.key)
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
+        chance, floating = jax.random.split(inputs.key)
         # Exact for a two-state process, which relaxes to its mean open share at the sum of both rates.
         both = self.rate + 1 / self.duration
-        turned = -jnp.expm1(-both * line.interval) / both
+        turned = -jnp.expm1(-both * inputs.interval) / both
         to_open, to_stay = self.rate * turned, 1 - turned / self.duration
         numbers = jax.random.uniform(chance, series.shape[:1], jnp.float32).astype(turned.dtype)
 
@@ -83,7 +83,7 @@ class IntermittentElectrode(AbstractReadoutEffect):
             return is_open, is_open
 
         state, is_open = jax.lax.scan(step, state, numbers)
-        touches = line.pattern == self.electrode
+        touches = inputs.pattern == self.electrode
         sign = touches[:, 2].astype(series.dtype) - touches[:, 3].astype(series.dtype)
         lost = jnp.outer(self.floating * normal(floating, series[:, 0]), sign)
         lost = jnp.where(touches[:, :2].any(1), 0, lost).astype(series.dtype)
@@ -110,7 +110,7 @@ class MuxSettling(AbstractReadoutEffect):
     def start(self, first: Float[Array, " channels"]) -> State:
         return first[-1]
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
         # All frames start from zero in parallel; each then adds the end of the frame before it. 1024 frames of 550
         # readings take 550 + 1024 steps instead of 563,200.
         times = self.settle / self.time_constant * jnp.arange(1, series.shape[1] + 1, dtype=float)
@@ -137,10 +137,10 @@ class BaselineDrift(AbstractReadoutEffect):
     def start(self, first: Float[Array, " channels"]) -> State:
         return jnp.zeros_like(first), jnp.abs(first)
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
         walked, size = state
-        std = (self.rate * jnp.sqrt(line.interval)).astype(series.dtype)
-        walk = _decaying_sums(1.0, walked, std * normal(line.key, series))
+        std = (self.rate * jnp.sqrt(inputs.interval)).astype(series.dtype)
+        walk = _decaying_sums(1.0, walked, std * normal(inputs.key, series))
         return series + size * walk, (walk[-1], size)
 
 
@@ -159,7 +159,7 @@ class GainError(AbstractReadoutEffect):
     seed: Int[Array, ""] = parameter(0)
     stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
         return series * (1 + self.std * own_normal(self, self.seed, series.shape[1:], series.dtype)), state
 
 
@@ -178,7 +178,7 @@ class LoadCellError(AbstractReadoutEffect):
     nonlinearity: Float[Array, ""] = parameter(1e-3, least=-jnp.inf)
     full_scale: Float[Array, ""] = parameter(50.0, above=0.0)
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
         return series * (1 + 4 * self.nonlinearity * (1 - jnp.abs(series) / self.full_scale)), state
 
 
@@ -193,8 +193,8 @@ class MultiplicativeNoise(AbstractReadoutEffect):
     std: Float[Array, ""] = parameter(1e-3)
     stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
-        return series * (1 + self.std * normal(line.key, series)), state
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
+        return series * (1 + self.std * normal(inputs.key, series)), state
 
 
 class Noise(AbstractReadoutEffect):
@@ -210,8 +210,8 @@ class Noise(AbstractReadoutEffect):
     std: Float[Array, ""] = parameter(1.0)
     stream: StreamKind = eqx.field(static=True, default=StreamKind.EIT)
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
-        return series + self.std * normal(line.key, series), state
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
+        return series + self.std * normal(inputs.key, series), state
 
 
 class PinkNoise(AbstractReadoutEffect):
@@ -234,7 +234,7 @@ class PinkNoise(AbstractReadoutEffect):
     def start(self, first: Float[Array, " channels"]) -> State:
         return jnp.zeros((len(POLES), first.size), first.dtype)
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
         keep = jnp.asarray(np.exp(-POLES), series.dtype)[:, None]
         weight = jnp.asarray(np.log(POLE_RATIO) * np.sqrt(POLES / np.pi), series.dtype)[:, None]
 
@@ -242,7 +242,7 @@ class PinkNoise(AbstractReadoutEffect):
             state = keep * state + white
             return state, (weight * state).sum(0)
 
-        state, pink = jax.lax.scan(step, state, normal(line.key, series))
+        state, pink = jax.lax.scan(step, state, normal(inputs.key, series))
         return series + self.amplitude * pink, state
 
 
@@ -266,7 +266,7 @@ class Quantisation(AbstractReadoutEffect):
     def __check_init__(self) -> None:
         require_relation(self, ("lowest", "highest"), lambda low, high: bool(low < high), "a range whose ends differ")
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
         return jnp.clip(jnp.round(series / self.step) * self.step, self.lowest, self.highest), state
 
 
@@ -297,7 +297,7 @@ class AdcRanges(AbstractReadoutEffect):
         fits = jnp.abs(first)[:, None] * self.headroom * gains <= self.full_scale
         return jnp.where(fits, gains, gains.min()).max(1)
 
-    def __call__(self, series: Series, state: State, line: Line) -> tuple[Series, State]:
+    def __call__(self, series: Series, state: State, inputs: HistoryInputs) -> tuple[Series, State]:
         half = jnp.exp2(self.bits.astype(float) - 1).astype(series.dtype)
         step = (self.full_scale / half / state).astype(series.dtype)
         return jnp.clip(jnp.round(series / step), -half, half - 1) * step, state

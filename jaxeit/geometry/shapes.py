@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from ..budget import require
-from ..kinds import is_number, shown
+from ..messages.kinds import is_number, shown
 
 Vectors = TypeVar("Vectors", np.ndarray, Array)
 

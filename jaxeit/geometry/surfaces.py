@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..kinds import is_number, shown
+from ..messages.kinds import is_number, shown
 
 
 class SurfaceError(ValueError):

@@ -36,13 +36,6 @@ from .hyperparameters import (
 )
 from .inputs import ConvergenceError as ConvergenceError, InverseError as InverseError
 from .level_set import LevelSet as LevelSet
-from .measured_noise import (
-    NOISES as NOISES,
-    AbstractNoise as AbstractNoise,
-    CorrelatedNoise as CorrelatedNoise,
-    EqualNoise as EqualNoise,
-    MeasuredNoise as MeasuredNoise,
-)
 from .methods import (
     METHODS as METHODS,
     AbstractIterativeMethod as AbstractIterativeMethod,
@@ -57,7 +50,6 @@ from .methods import (
     SparseBayes as SparseBayes,
     TruncatedSvd as TruncatedSvd,
 )
-from .noise import noise_covariance as noise_covariance
 from .preparation import prepare as prepare
 from .priors import (
     PRIORS as PRIORS,
@@ -72,6 +64,14 @@ from .priors import (
     Tikhonov as Tikhonov,
     TotalVariation as TotalVariation,
 )
+from .readings.measured_noise import (
+    NOISES as NOISES,
+    AbstractNoise as AbstractNoise,
+    CorrelatedNoise as CorrelatedNoise,
+    EqualNoise as EqualNoise,
+    MeasuredNoise as MeasuredNoise,
+)
+from .readings.noise import noise_covariance as noise_covariance
 from .reconstruction import (
     AbstractReconstructor as AbstractReconstructor,
     IterativeReconstructor as IterativeReconstructor,

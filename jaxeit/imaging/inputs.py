@@ -7,7 +7,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from .._compile import is_traced
-from ..kinds import require_unmasked, stated
+from ..messages.kinds import require_unmasked, stated
 from ..registry.limits import NO_NUMBERS
 
 

@@ -15,9 +15,9 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 
 from .._compile import verb
-from ..kinds import require_kind
 from ..least_squares import quadratic
 from ..least_squares.searches import HalfSquares
+from ..messages.kinds import require_kind
 from ..model.bases import Picture
 from ..registry import limited, require_limits
 from .absolute.images import IMAGE_STEPS, IMAGE_TOLERANCE, AbstractPosterior, ImagePosterior, Quadratic, most_probable

@@ -10,8 +10,8 @@ from scipy.sparse import csr_array
 
 from ..linalg.array_libraries import NUMPY
 from .inputs import require_frames
-from .missing import Missing, PairRows, completed_sums, correlated, removed
-from .whitening import Whitening
+from .readings.missing import Missing, PairRows, completed_sums, correlated, removed
+from .readings.whitening import Whitening
 
 
 class NumpyImages:

@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from .._compile import full_precision, is_traced, verb
-from ..kinds import is_number, require_kind
+from ..messages.kinds import is_number, require_kind
 from ..model.bases import AbstractBasis, BasisMap, Pixels
 from ..model.discretisation import Model, require_model
 from ..model.sensitivity import pair_jacobian
@@ -23,9 +23,9 @@ from .inputs import InverseError
 from .methods import AbstractIterativeMethod, AbstractLinearMethod, OneStep, Problem
 from .methods.one_step import one_step_image
 from .priors import AbstractPrior, Noser
+from .readings.whitening import Whitened, Whitening, whitened_readings
 from .reconstruction import IterativeReconstructor, Provenance, Reconstructor
 from .untouched import background_of
-from .whitening import Whitened, Whitening, whitened_readings
 
 T = TypeVar("T")
 

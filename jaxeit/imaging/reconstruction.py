@@ -19,9 +19,9 @@ from ..model.bases import AbstractPictured, Picture
 from ..notebook import card, picture
 from .inputs import InverseError, as_flags, require_frames, require_some
 from .methods import AbstractIterativeMethod, Problem
-from .missing import completed_sums_of_frame, removed, without_readings
 from .numpy_images import NumpyImages
-from .whitening import Whitening
+from .readings.missing import completed_sums_of_frame, removed, without_readings
+from .readings.whitening import Whitening
 
 
 class Provenance(dict[str, str]):

@@ -17,11 +17,11 @@ from jaxtyping import Array, Bool, DTypeLike, Float, Int, Shaped
 from scipy.ndimage import distance_transform_edt, label, map_coordinates
 
 from .._compile import require_known
-from ..kinds import require_kind
+from ..messages.kinds import require_kind
 from ..model.bases import AbstractBasis, AbstractPictured, BasisMap, Picture
 from ..model.discretisation import Model, require_model
 from ..model.forward_model import forward
-from ..model.metal_sheet import containing_triangles
+from ..model.matrix.metal_sheet import containing_triangles
 from ..registry import limited, require_limits
 from .absolute.frames import checked_frame
 from .absolute.images import (

@@ -6,15 +6,15 @@ from dataclasses import dataclass, field
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from ..kinds import require_kind
+from ..messages.kinds import require_kind
 from ..model.bases import BASES, AbstractBasis, Pixels
 from ..model.discretisation import Model
 from .hyperparameters import HYPERPARAMETERS, AbstractHyperparameter
 from .inputs import InverseError
-from .measured_noise import NOISES, AbstractNoise, EqualNoise
 from .methods import METHODS, AbstractIterativeMethod, AbstractLinearMethod, OneStep
 from .preparation import Settings, prepare, require_choices
 from .priors import PRIORS, AbstractPrior, Noser
+from .readings.measured_noise import NOISES, AbstractNoise, EqualNoise
 from .reconstruction import IterativeReconstructor, Reconstructor
 
 

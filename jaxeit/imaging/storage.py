@@ -19,9 +19,9 @@ from ..array_files import DAMAGE, read_arrays, write_arrays
 from ..linalg import is_covariance
 from ..model.bases import Picture
 from .methods import AbstractIterativeMethod, Problem
+from .readings.whitening import Whitening, lines_of, lines_of_shares
 from .reconstruction import IterativeReconstructor, Provenance, Reconstructor
 from .settings import Imaging
-from .whitening import Whitening, lines_of, lines_of_shares
 
 FORMAT = "jaxeit reconstructor 1"
 

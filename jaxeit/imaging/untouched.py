@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from ..kinds import stated
+from ..messages.kinds import stated
 from ..model.discretisation import Model
 from ..model.forward_model import CoatedSheet
 from . import absolute  # which is imported on first use, since its solvers take a tenth of a second

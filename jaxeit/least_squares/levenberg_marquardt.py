@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from ..spelling import did_you_mean
+from ..messages.spelling import did_you_mean
 from .searches import BoundedDescent, Cholesky, DampingSearch, HalfSquares, Parameters, Scalar, normal_equations
 
 OPTIONS = frozenset({"lower", "upper", "curvature", "quadratic", "aim", "outlook", "state"})

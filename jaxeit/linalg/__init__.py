@@ -36,7 +36,7 @@ from .conjugate_gradient import ConjugateGradient, Single
 from .covariance import is_covariance
 from .dense import Dense
 from .lapack import eigh, solve, svd
-from .nested_dissection import NestedDissection
+from .multifrontal.nested_dissection import NestedDissection
 
 __all__ = [
     "SOLVERS",

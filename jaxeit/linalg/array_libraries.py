@@ -10,7 +10,7 @@ import scipy.linalg
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from ..kinds import require_unmasked, stated
+from ..messages.kinds import require_unmasked, stated
 from . import lapack
 
 

@@ -18,7 +18,7 @@ from ..budget import require
 from ..geometry.shapes import Domain, Rectangle
 from .footprints import AbstractFootprint, Feature, cycle, neighbours, require_placed
 from .sizes import SizeField, divide_rim, fill, narrow_places, thin
-from .smoothing import Problem, Triangulation, better, missing_edges, relax
+from .smoothing import SmoothingConstraints, Triangulation, better, missing_edges, relax
 from .triangles import CROWDED, MIN_ANGLE, Mesh, MeshError, place
 
 START_SPACINGS = (0.72, 0.69, 0.75, 0.66, 0.78)
@@ -72,7 +72,7 @@ def triangulate(
     return Mesh(points, triangles).check(advice=CROWDED)
 
 
-def _relaxed(problem: Problem, free: np.ndarray) -> Triangulation:
+def _relaxed(problem: SmoothingConstraints, free: np.ndarray) -> Triangulation:
     """The first triangulation that is good enough, or the best one; free: places for nodes, (n, 2) m."""
     size, found = problem.size(free), []
     for spacing in START_SPACINGS:
@@ -109,7 +109,7 @@ def expected_nodes(
     return float(own + (domain.area / longest**2 + 2 * np.pi * (graded - even).sum()) / np.sqrt(0.75))
 
 
-def _require_followed(problem: Problem, triangles: np.ndarray) -> None:
+def _require_followed(problem: SmoothingConstraints, triangles: np.ndarray) -> None:
     missing = missing_edges(problem, triangles)
     if len(missing):
         where = problem.fixed[missing[0]].mean(0)
@@ -186,13 +186,15 @@ def _fitted(features: list[Feature], domain: Domain) -> list[Feature]:
     return [Feature(f.centre, f.radius, min(f.size, r)) for f, r in zip(features, room.tolist(), strict=True)]
 
 
-def _problem(domain: Domain, footprints: list[AbstractFootprint], rim: np.ndarray, size: SizeField) -> Problem:
+def _problem(
+    domain: Domain, footprints: list[AbstractFootprint], rim: np.ndarray, size: SizeField
+) -> SmoothingConstraints:
     """Fixed nodes and the edges between them: those of the rim, then those of each footprint."""
     around = domain.boundary_point(divide_rim(domain, rim, size))
     own = [footprint.nodes(domain) for footprint in footprints]
     first = len(around) + np.cumsum([0, *map(len, own)])
     rings = [start + footprint.edges() for start, footprint in zip(first, footprints, strict=False)]
-    return Problem(
+    return SmoothingConstraints(
         domain=domain,
         size=size,
         fixed=np.concatenate([around, *own]),

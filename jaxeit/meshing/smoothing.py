@@ -32,7 +32,7 @@ ROUNDS, SWEEPS, POLISHES = 3, 2, 8
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class SmoothingConstraints:
     """The constraints on `relax`.
 
     | meaning                                                      | shape  | unit |
@@ -58,7 +58,7 @@ class Triangulation(NamedTuple):
     triangles: np.ndarray
 
 
-def relax(problem: Problem, free: np.ndarray) -> Triangulation:
+def relax(problem: SmoothingConstraints, free: np.ndarray) -> Triangulation:
     """The best triangulation found, starting from the free nodes (n, 2) m."""
     points = np.concatenate([problem.fixed, free])
     triangles = delaunay(points, problem.domain)
@@ -80,14 +80,14 @@ def better(one: Triangulation, other: Triangulation) -> Triangulation:
     return other if other.angle > one.angle else one
 
 
-def quality(problem: Problem, points: np.ndarray, triangles: np.ndarray) -> float:
+def quality(problem: SmoothingConstraints, points: np.ndarray, triangles: np.ndarray) -> float:
     """Smallest angle in degrees, or -1 where an edge of the rim or of a ring is missing."""
     if len(missing_edges(problem, triangles)):
         return -1.0
     return float(corner_angles(points[triangles]).min())
 
 
-def missing_edges(problem: Problem, triangles: np.ndarray) -> np.ndarray:
+def missing_edges(problem: SmoothingConstraints, triangles: np.ndarray) -> np.ndarray:
     """Edges (k, 2) of the rim and the rings that no triangle has, and edges of the rim with
     triangles outside the domain."""
     directed = directed_edges(triangles)
@@ -152,7 +152,7 @@ def _circles(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return corners[:, 0] + offset, np.linalg.norm(offset, axis=1)
 
 
-def _sweep(problem: Problem, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def _sweep(problem: SmoothingConstraints, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """One step of every free node to the weighted mean of its triangles' circumcentres."""
     corners = points[triangles]
     centroids = corners.mean(1)
@@ -175,14 +175,14 @@ def _vertex_means(triangles: np.ndarray, values: np.ndarray, weights: np.ndarray
     return np.stack(sums, -1) / np.where(total > 0, total, 1.0)[:, None]
 
 
-def _adapt(problem: Problem, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def _adapt(problem: SmoothingConstraints, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """The points without crowded or misplaced free nodes, and with new nodes in gaps."""
     new = _gap_nodes(problem, points, triangles)
     keep = ~_crowded(problem, points, triangles) & ~_misplaced(problem, points)
     return np.concatenate([points[keep], new])
 
 
-def _gap_nodes(problem: Problem, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def _gap_nodes(problem: SmoothingConstraints, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     corners = points[triangles]
     centroids = corners.mean(1)
     wanted = problem.size(centroids)
@@ -192,7 +192,7 @@ def _gap_nodes(problem: Problem, points: np.ndarray, triangles: np.ndarray) -> n
     return thin(centroids[wide], points, 0.5 * wanted[wide])
 
 
-def _crowded(problem: Problem, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def _crowded(problem: SmoothingConstraints, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Free nodes whose mean edge is too short or that have four edges or fewer, no two of them
     neighbours; (n,) bool."""
     start, stop = directed_edges(triangles).T
@@ -222,7 +222,7 @@ def _independent(wanted: np.ndarray, order: np.ndarray, triangles: np.ndarray) -
     return chosen
 
 
-def _misplaced(problem: Problem, points: np.ndarray) -> np.ndarray:
+def _misplaced(problem: SmoothingConstraints, points: np.ndarray) -> np.ndarray:
     """Free nodes outside the domain or so near to an edge that must appear that they block it; (n,) bool."""
     fixed = len(problem.fixed)
     astray = np.zeros(len(points), bool)
@@ -237,7 +237,7 @@ def _misplaced(problem: Problem, points: np.ndarray) -> np.ndarray:
     return astray
 
 
-def _polish(problem: Problem, angle: float, points: np.ndarray, triangles: np.ndarray) -> Triangulation:
+def _polish(problem: SmoothingConstraints, angle: float, points: np.ndarray, triangles: np.ndarray) -> Triangulation:
     """Raise the smallest angles by moving single nodes; the smallest angle never decreases."""
     for _ in range(POLISHES):
         if angle >= GOOD_ANGLE:

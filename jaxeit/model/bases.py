@@ -16,7 +16,7 @@ from ..linalg.base import on_device
 from ..registry import Registry, limited, require_limits
 from ..registry.limits import LONGEST
 from .discretisation import Model
-from .stiffness import Stiffness, stiffness
+from .matrix.stiffness import Stiffness, stiffness
 
 
 class BasisError(ValueError):

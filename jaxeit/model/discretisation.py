@@ -26,11 +26,11 @@ from ..notebook import MAX_LINES, Drawing, card
 from ..skin.description import Skin
 from ..skin.electrodes.base import touched
 from .fidelity import Fidelity, FidelityError, require_dtype
-from .metal_sheet import Coat, assembled_coat
+from .matrix.metal_sheet import Coat, assembled_coat
+from .matrix.system import System, system_arrays, system_of
+from .matrix.unknowns import number_unknowns
 from .mixing import Mixing, padded_rows
 from .scene import Scene, SceneError
-from .system import System, system_arrays, system_of
-from .unknowns import number_unknowns
 
 COAT_EDGES = 2.0
 """Edge length of a coat's mesh over that of the sheet's.  At 0.1 ohm, potential differences in the metal contribute a

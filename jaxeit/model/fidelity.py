@@ -7,9 +7,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..kinds import is_number, require_kind, shown, stated
 from ..linalg import AbstractLinearSolver
 from ..meshing.elements import BY_ORDER
+from ..messages.kinds import is_number, require_kind, shown, stated
 
 
 class FidelityError(ValueError):

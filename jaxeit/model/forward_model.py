@@ -38,8 +38,8 @@ from ..linalg import AbstractPlan, inverse_columns
 from ..linalg.array_libraries import real_array
 from ..linalg.small_matrices import summed
 from .discretisation import Model, require_model
-from .metal_sheet import CoatCoefficients, CoatFields, assemble_coat, coat_energy, coat_fields
-from .system import System
+from .matrix.metal_sheet import CoatCoefficients, CoatFields, assemble_coat, coat_energy, coat_fields
+from .matrix.system import System
 
 
 class CoatedSheet(NamedTuple):
@@ -479,7 +479,7 @@ def energy(model: Model, theta: Coefficients, x: Fields) -> Float[Array, "a b"]:
     gradients = system.gradients(x.potential)
     # As a product of stored matrices, whose derivative by sigma is one as well: XLA would gather the potentials again
     # for each use, and multiply with the axes of a product of three transposed.
-    rows = jax.lax.optimization_barrier(gradients.reshape(-1, gradients.shape[2]))
+    rows: Array = jax.lax.optimization_barrier(gradients.reshape(-1, gradients.shape[2]))
     sigma = jnp.broadcast_to(theta.sigma[:, None], gradients.shape[:2]).reshape(-1, 1)
     sheet = (sigma * rows).T @ rows
     drop = x.drop[system.contact_dofs]

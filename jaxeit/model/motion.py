@@ -25,8 +25,8 @@ from ..meshing.elements import BY_ORDER, P1, element_slopes
 from ..meshing.triangles import Mesh
 from .discretisation import Model, require_model
 from .forward_model import Coefficients, Fields, coefficients, fields, series_resistance, terminal_matrix, voltages
-from .stiffness import TableBatch
-from .system import Entries, System, stiffness_places
+from .matrix.stiffness import TableBatch
+from .matrix.system import Entries, System, stiffness_places
 
 # The cosine between rim edges that meet in a corner, which no electrode passes.
 CORNER = np.cos(np.radians(30))

@@ -8,7 +8,7 @@ import numpy as np
 from jax.tree_util import keystr, tree_flatten_with_path
 
 from ..effects import EFFECTS, AbstractEffect
-from ..kinds import stated
+from ..messages.kinds import stated
 from ..skin.description import Skin
 from ..toml import TomlTable
 

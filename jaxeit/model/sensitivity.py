@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int, Integer
 from .._compile import verb
 from ..budget import require
 from ..effects import AbstractTerminalEffect, chosen
-from ..kinds import require_kind
+from ..messages.kinds import require_kind
 from .bases import AbstractBasis, BasisMap, Elements
 from .discretisation import Model, require_model
 from .forward_model import (

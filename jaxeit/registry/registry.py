@@ -17,7 +17,7 @@ from importlib.metadata import EntryPoint, entry_points
 from inspect import isabstract, isclass
 from typing import Any, Generic, TypeVar, cast
 
-from ..spelling import did_you_mean
+from ..messages.spelling import did_you_mean
 from ..toml import TomlError, TomlTable, parse_values
 from .settings import Part, fields_of, settings_of
 

@@ -44,7 +44,7 @@ def computed() -> Any:
     return eqx.field(default=None, metadata={"computed": True})
 
 
-class Form(NamedTuple):
+class TextForm(NamedTuple):
     """One form that a value may have in text: a test of the value, its description for messages, and its conversion."""
 
     accepts: Callable[[Any], bool]
@@ -57,16 +57,16 @@ def _is_number(value: Any) -> bool:
     return whole or (type(value) is float and math.isfinite(value))
 
 
-BOOLEAN = Form(lambda v: type(v) is bool, "true or false", bool)
-INTEGER = Form(lambda v: type(v) is int and 0 <= v <= LARGEST_INT, "a whole number from 0", int)
-NUMBER = Form(_is_number, "a number", float)
-LIMIT = Form(lambda v: type(v) is float and math.isinf(v), "inf", float)
-TEXT = Form(lambda v: isinstance(v, str), "a text", str)
+BOOLEAN = TextForm(lambda v: type(v) is bool, "true or false", bool)
+INTEGER = TextForm(lambda v: type(v) is int and 0 <= v <= LARGEST_INT, "a whole number from 0", int)
+NUMBER = TextForm(_is_number, "a number", float)
+LIMIT = TextForm(lambda v: type(v) is float and math.isinf(v), "inf", float)
+TEXT = TextForm(lambda v: isinstance(v, str), "a text", str)
 FORM_OF_DTYPE = {"Bool": BOOLEAN, "Int": INTEGER, "Integer": INTEGER, "UInt": INTEGER}
 FORM_OF_TYPE = {bool: BOOLEAN, int: INTEGER, float: NUMBER, str: TEXT}
 
 
-def _list_of(form: Form, rank: int, length: int | None) -> Form:
+def _list_of(form: TextForm, rank: int, length: int | None) -> TextForm:
     """Lists of values of this form, nested ``rank`` deep; the values become tuples."""
     if rank == 0:
         return form
@@ -76,15 +76,15 @@ def _list_of(form: Form, rank: int, length: int | None) -> Form:
         return isinstance(value, list) and length in (None, len(value)) and all(map(inner.accepts, value))
 
     meaning = f"[{inner.meaning}, ...]" if length is None else "[" + ", ".join([inner.meaning] * length) + "]"
-    return Form(accepts, meaning, lambda v: tuple(map(inner.convert, v)))
+    return TextForm(accepts, meaning, lambda v: tuple(map(inner.convert, v)))
 
 
-def _choice_of(kind: type[enum.Enum]) -> Form:
+def _choice_of(kind: type[enum.Enum]) -> TextForm:
     values = [member.value for member in kind]
-    return Form(lambda v: v in values, "one of " + ", ".join(f'"{v}"' for v in values), kind)
+    return TextForm(lambda v: v in values, "one of " + ", ".join(f'"{v}"' for v in values), kind)
 
 
-def _forms(hint: Any, default: Any) -> list[Form]:
+def _forms(hint: Any, default: Any) -> list[TextForm]:
     """The forms of values that an annotation allows; empty if text cannot give such a value."""
     if get_origin(hint) in (Union, UnionType):
         every = [form for part in get_args(hint) for form in _forms(part, default)]
@@ -103,13 +103,13 @@ def _forms(hint: Any, default: Any) -> list[Form]:
     return [FORM_OF_TYPE[hint]] if hint in FORM_OF_TYPE else []
 
 
-def _forms_of_tuple(parts: tuple[Any, ...]) -> list[Form]:
+def _forms_of_tuple(parts: tuple[Any, ...]) -> list[TextForm]:
     if not parts or parts[0] not in FORM_OF_TYPE:
         return []
     return [_list_of(FORM_OF_TYPE[parts[0]], 1, None if parts[-1] is Ellipsis else len(parts))]
 
 
-def _forms_of_array(hint: Any) -> list[Form]:
+def _forms_of_array(hint: Any) -> list[TextForm]:
     if "..." in hint.dim_str or "*" in hint.dim_str:
         return []
     kind = FORM_OF_DTYPE.get(hint.dtype.__name__, NUMBER)
@@ -125,7 +125,7 @@ class Setting:
     """
 
     name: str
-    forms: tuple[Form, ...]
+    forms: tuple[TextForm, ...]
     default: Any
     description: str
     part: Part | None

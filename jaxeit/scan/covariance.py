@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float
 from .._compile import verb
 from ..imaging.inputs import InverseError, known_flags, require_some
 from ..imaging.methods import Problem
-from ..imaging.noise import noise_weight
 from ..imaging.priors import AbstractPrior, Noser
+from ..imaging.readings.noise import noise_weight
 from ..model.bases import AbstractBasis, BasisMap, Picture, Pixels
 from ..model.discretisation import Model
 from ..model.sensitivity import jacobian

@@ -16,8 +16,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Integer
 
 from .._compile import is_traced, require_known, verb
-from ..kinds import is_number, require_kind, shown
 from ..linalg.array_libraries import real_array
+from ..messages.kinds import is_number, require_kind, shown
 from ..skin.protocol import Protocol, ProtocolError
 
 # A gain below this part of the largest one is rounding error: the readings taken before span the range of K.

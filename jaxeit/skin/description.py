@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from ..budget import require
 from ..geometry.shapes import Disc, Domain, Polygon, Rectangle
 from ..geometry.surfaces import AbstractSurface, Cylinder, Sphere, SurfaceError
-from ..kinds import require_kind, stated
+from ..messages.kinds import require_kind, stated
 from ..notebook import Drawing, card
 from ..registry import RegistryError
 from ..toml import TomlError, TomlTable, parse_toml, read_text

@@ -52,7 +52,7 @@ class Hypothesis(NamedTuple):
         return left._replace(belief=merge_contacts(self.belief, j, k), edges=edges[:k] + edges[k + 1 :])
 
 
-class Events:
+class EventHypotheses:
     """Generates the hypotheses that are compared where a frame is unexpected."""
 
     def __init__(self, settings: TrackerSettings, area: float):

@@ -20,7 +20,7 @@ import numpy as np
 
 from .belief.filter import CONTACT_SIZE, Update
 from .belief.programs import Programs
-from .events import Events, Hypothesis
+from .events import EventHypotheses, Hypothesis
 from .tracks import MAX_PATIENCE, PATIENCE, Backlog, Look, Observation, Tracking, Trial
 
 # Signal-to-noise ratio below which a contact is faint, and number of such frames after which it dies.
@@ -62,7 +62,7 @@ def _doubtful_contacts(now: Tracking) -> list[int]:
 
 
 def begin_recount(
-    before: Tracking, uneventful: Tracking, observation: Observation, programs: Programs, events: Events
+    before: Tracking, uneventful: Tracking, observation: Observation, programs: Programs, events: EventHypotheses
 ) -> Look:
     """Begin to compare one contact fewer with all contacts in a frame; arguments as for `begin_look`."""
     positions, reborn = np.asarray(before.belief.contacts)[:, :2], _unchanged(before)
@@ -121,7 +121,7 @@ def _unchanged(now: Tracking) -> Hypothesis:
     return Hypothesis(now.belief, now.numbers, now.edges)
 
 
-def advance_look(look: Look, programs: Programs, events: Events) -> Look:
+def advance_look(look: Look, programs: Programs, events: EventHypotheses) -> Look:
     """Advance a look by one piece, until it has the contacts after its frame."""
     if not look.best.ended:
         return replace(look, best=_advance_trial(look.best, look.observation, programs))
@@ -155,7 +155,7 @@ def _is_explained(careful: Update, size: int, log_prior: float) -> bool:
     return is_finite(careful) and gain + log_prior < 0
 
 
-def _event_trials(look: Look, careful: Update, programs: Programs, events: Events) -> tuple[Trial, ...]:
+def _event_trials(look: Look, careful: Update, programs: Programs, events: EventHypotheses) -> tuple[Trial, ...]:
     """Trials of the events that may have happened."""
     before, observation = _unchanged(look.before), look.observation
     place = programs.birth_position(careful.belief, observation.dv, observation.pads)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from .._compile import require_known
 from ..contacts.loads.learned.model_error import select_model_error
 from ..imaging.inputs import InverseError, require_real
-from ..kinds import require_unmasked
+from ..messages.kinds import require_unmasked
 from .belief.filter import Pads
 from .belief.layer import LearnedLayer
 from .looks import has_converged

@@ -16,7 +16,7 @@ from ..contacts.preparation import prepare_contacts
 from ..contacts.settings import ContactSettings
 from ..fusion import pad_masks
 from ..imaging.absolute.background import UntouchedSheet
-from ..imaging.whitening import whitened_readings
+from ..imaging.readings.whitening import whitened_readings
 from ..linalg.base import on_device
 from ..model.bases import Pixels
 from ..model.discretisation import Model, discretise

@@ -5,7 +5,7 @@ from functools import partial
 
 from ..contacts.loads import LoadSettings
 from ..imaging.inputs import InverseError
-from ..kinds import require_kind
+from ..messages.kinds import require_kind
 from ..model.fidelity import Fidelity
 from ..registry import limited, require_limits
 

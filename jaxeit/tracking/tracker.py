@@ -16,14 +16,14 @@ from .._compile import require_known
 from ..imaging.absolute.background import UntouchedSheet, fitted_sheet
 from ..imaging.inputs import InverseError, require_real
 from ..imaging.untouched import untouched_frame
-from ..kinds import require_kind, require_unmasked
+from ..messages.kinds import require_kind, require_unmasked
 from ..model.discretisation import Model, require_model
 from ..skin.description import Skin
 from .belief.consider import ConsiderErrors
 from .belief.filter import CONTACT_SIZE, LOAD_SIZE, MIN_PAD_SHARE, Belief, ContactFilter, Pads, Update
 from .belief.layer import GainField, LearnedLayer
 from .belief.programs import Programs
-from .events import Events
+from .events import EventHypotheses
 from .looks import (
     advance_look,
     apply_update,
@@ -71,7 +71,12 @@ class Tracker:
         self, tracker: ContactFilter, presses: ContactFilter, settings: TrackerSettings, area: float, field: GainField
     ):
         """`presses`: the filter of single presses, which reaches farther; `area`: of the skin, m^2."""
-        self.filter, self.press_filter, self.events, self.field = tracker, presses, Events(settings, area), field
+        self.filter, self.press_filter, self.events, self.field = (
+            tracker,
+            presses,
+            EventHypotheses(settings, area),
+            field,
+        )
         self.area = area
         self._settings, self.programs = settings, Programs(tracker)
 

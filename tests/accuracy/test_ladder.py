@@ -12,7 +12,7 @@ from hypothesis import given, settings, strategies as st
 import calib.cli
 import jaxeit as je
 from benchmarks import ladder as benchmark
-from calib.cli.commands.bench_command import bench_scene
+from calib.cli.commands.skins.bench_command import bench_scene
 from calib.report.figures.accuracy import ladder_figure
 from jaxeit.accuracy.image_quality import misplaced
 from jaxeit.accuracy.recommendation import Reference, Times

@@ -20,7 +20,7 @@ import jaxeit as je
 from calib.batch import cluster
 from calib.batch.digests import describe
 from calib.calibration.logs.procedure import curves_of
-from calib.calibration.recipe_text import curve_choice
+from calib.calibration.recipes.text import curve_choice
 from calib.cli import main
 from calib.runtime import settings, take_over
 

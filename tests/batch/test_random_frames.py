@@ -18,9 +18,9 @@ import calib
 import jaxeit as je
 from calib.batch import random_frames
 from calib.bench import BenchError, Footprint, FrameSet, RandomScenes
-from calib.bench.random_scenes import MAX_CONTACTS, arrange_tips, draw_contacts
-from calib.bench.scene_frames import SHARD_FRAMES, SceneFrames
-from calib.bench.training_frames import ARRAYS
+from calib.bench.training.random_scenes import MAX_CONTACTS, arrange_tips, draw_contacts
+from calib.bench.training.scene_frames import SHARD_FRAMES, SceneFrames
+from calib.bench.training.training_frames import ARRAYS
 from calib.cli import main
 
 from ..helpers import skin_of

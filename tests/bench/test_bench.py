@@ -294,7 +294,7 @@ class Breaks(je.effects.AbstractReadoutEffect):
 
     stream: ClassVar[je.effects.StreamKind] = je.effects.StreamKind.PRESSURE
 
-    def __call__(self, series, state, line):
+    def __call__(self, series, state, inputs):
         return series / jnp.abs(series), state
 
 

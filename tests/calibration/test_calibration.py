@@ -20,9 +20,9 @@ from scipy.special import ndtri
 import calib
 import jaxeit as je
 from calib.bench import simulate
+from calib.calibration.application.force_maps import force_model, fused
 from calib.calibration.archives.storage import SEAL, to_archive
 from calib.calibration.evaluation import render_table
-from calib.calibration.force_maps import force_model, fused
 from calib.calibration.localisation.locators import ROWS, CentroidLocator, locate, locator_from_numbers, locator_numbers
 from calib.calibration.localisation.press_images import fit_untouched_sheet
 from calib.calibration.procedure import _not_predicted

@@ -9,7 +9,7 @@ import calib
 import jaxeit as je
 from calib.calibration.localisation import contact_tracks
 from calib.calibration.localisation.contact_tracks import ContactTracks
-from calib.calibration.localisation.law_lessons import ContactLawLearner
+from calib.calibration.localisation.learned.law_lessons import ContactLawLearner
 from calib.live.follower import LiveFollower
 from calib.session import SessionError
 from jaxeit.tracking import ContactLaw, GainField, LearnedLayer, TimedTracks, Track, Tracker, TrackerSettings, Tracking

@@ -9,7 +9,7 @@ import pytest
 import jaxeit as je
 from calib.bench import load_bench, simulate
 from calib.bench.motion import loads_at, planned_motion
-from calib.calibration.application import FORCE_MAP_FORMAT, LOADS, TRACKS
+from calib.calibration.application.map_files import FORCE_MAP_FORMAT, LOADS, TRACKS
 from calib.calibration.calibration import Calibration
 from calib.calibration.localisation import contact_tracks
 from calib.calibration.localisation.contact_tracks import (

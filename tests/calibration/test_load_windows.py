@@ -11,7 +11,7 @@ import calib
 import jaxeit as je
 from calib.bench import load_bench, simulate
 from calib.calibration.localisation import load_windows
-from calib.calibration.localisation.learned_loads import MAX_PRESSES, MIN_PRESSES, learned_loads, render_loads
+from calib.calibration.localisation.learned.loads import MAX_PRESSES, MIN_PRESSES, learned_loads, render_loads
 from calib.calibration.localisation.load_windows import WindowedFrames
 from calib.calibration.localisation.proposals import chosen_proposal
 from calib.calibration.press_examples import PressExamples

@@ -10,7 +10,7 @@ import pytest
 
 import calib
 import jaxeit as je
-from calib.calibration.recipe import RecipeError
+from calib.calibration.recipes.recipe import RecipeError
 from calib.cli.recipe_options import add_recipe_arguments, recipe_of
 from calib.fitting import CURVES, FIELDS, LOSSES
 from calib.session import SessionError

@@ -15,7 +15,7 @@ import pytest
 
 from calib.calibration import Calibration
 from calib.cli import COMMANDS, main
-from calib.cli.commands import live_command
+from calib.cli.commands.calibrations import live_command
 from calib.cli.terminal import say
 from calib.presses import Processing
 from calib.session import Session

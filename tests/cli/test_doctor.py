@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from calib.cli import diagnosis as doctor, main
-from calib.cli.diagnosis import Line, examine
+from calib.cli.diagnosis import DiagnosisLine, examine
 from calib.record import priority
 from calib.record.priority import PriorityError
 
@@ -125,6 +125,6 @@ def test_without_flags_of_xla_no_process_is_started(monkeypatch):
 
 
 def test_a_line_reads_well():
-    assert Line("a", "b").render() == "ok    a: b"
-    assert Line("a", "b", "c").render() == "BAD   a: b\n      -> c"
-    assert Line("a", "b", "c", note=True).render().startswith("note  a")
+    assert DiagnosisLine("a", "b").render() == "ok    a: b"
+    assert DiagnosisLine("a", "b", "c").render() == "BAD   a: b\n      -> c"
+    assert DiagnosisLine("a", "b", "c", note=True).render().startswith("note  a")

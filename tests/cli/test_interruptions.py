@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from calib.cli import main
-from calib.live import presentation
+from calib.live.views import presentation
 from calib.session.hdf5 import storage
 from tests.record.test_full_disk import SCENE
 from tests.record.test_recorder import both, journal
@@ -141,7 +141,7 @@ def test_an_interruption_within_a_collection_of_garbage_ends_the_command(number,
         time.sleep(60)  # cut short
         return 0
 
-    monkeypatch.setattr("calib.cli.commands.doctor_command.run", run)
+    monkeypatch.setattr("calib.cli.commands.skins.doctor_command.run", run)
     assert main(["doctor"]) == status
 
 

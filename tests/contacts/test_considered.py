@@ -9,8 +9,8 @@ from benchmarks.bench_loads import INSIDE, TIP_SPREAD, shaped
 from benchmarks.problems import pressed, uneven
 from calib.calibration.localisation.load_windows import LOAD_FIDELITY
 from jaxeit.contacts import prepare_loads
-from jaxeit.contacts.loads.considered import Linearisation, inverse_of, mean_errors
-from jaxeit.contacts.loads.pressure import MAX_LOADS, Form, even_moments, shape_directions, spot, tilt_directions
+from jaxeit.contacts.loads.fits.shape_errors import Linearisation, inverse_of, mean_errors
+from jaxeit.contacts.loads.pressure import MAX_LOADS, LoadForm, even_moments, shape_directions, spot, tilt_directions
 from jaxeit.contacts.loads.sheet import Sensitivities
 from tests.compiled import compiled
 
@@ -74,7 +74,7 @@ def test_moments_of_next_order_change_nothing_that_the_others_change():
     axis = np.arange(0, 0.2, 5e-4) + 2.5e-4
     points, area = jnp.stack(jnp.meshgrid(axis, axis), -1), 5e-4**2
     one = jnp.array([0.1, 0.1, np.log(0.01), np.log(7.0), 0.0, 0.0])
-    rows, forms = jnp.stack([one] * MAX_LOADS), jnp.array([Form.ROUND] + [Form.ABSENT] * (MAX_LOADS - 1))
+    rows, forms = jnp.stack([one] * MAX_LOADS), jnp.array([LoadForm.ROUND] + [LoadForm.ABSENT] * (MAX_LOADS - 1))
     tilts = np.asarray(compiled(tilt_directions, rows, forms, points))
     assert not tilts[..., 2:].any()
     away = (np.asarray(points) - 0.1) / 0.01
@@ -89,7 +89,7 @@ def test_moments_of_next_order_change_nothing_that_the_others_change():
 def test_even_moments_are_equal_at_opposite_places():
     points = jnp.asarray(np.random.default_rng(4102).uniform(-0.02, 0.02, (9, 2)))
     row = jnp.array([0.0, 0.0, np.log(0.01), 2.0, 0.0, 0.0])
-    forms = jnp.array([Form.ROUND] + [Form.ABSENT] * (MAX_LOADS - 1))
+    forms = jnp.array([LoadForm.ROUND] + [LoadForm.ABSENT] * (MAX_LOADS - 1))
     found = np.asarray(
         compiled(shape_directions, jnp.stack([row] * MAX_LOADS), forms, jnp.concatenate([points, -points]))
     )

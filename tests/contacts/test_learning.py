@@ -9,8 +9,8 @@ import pytest
 
 import jaxeit as je
 from jaxeit.contacts import ForceLaw, LoadKind, LoadSettings, learn_loads, prepare_loads
-from jaxeit.contacts.loads.comparison import load_shape
-from jaxeit.contacts.loads.fits import Fit, FrameFits
+from jaxeit.contacts.loads.fits.comparison import load_shape
+from jaxeit.contacts.loads.fits.kinds import Fit, FrameFits
 from jaxeit.contacts.loads.learned import learning
 from jaxeit.contacts.loads.learned.model_error import ERROR_RATIO, MAX_ERROR, select_model_error
 from jaxeit.contacts.loads.search import FrameSearch

@@ -11,12 +11,12 @@ import pytest
 import jaxeit as je
 from calib.calibration.localisation.load_windows import LOAD_FIDELITY
 from jaxeit.contacts import AbstractGain, LoadKind, LoadSettings, prepare_loads
-from jaxeit.contacts.loads.comparison import evidences, log_evidence
-from jaxeit.contacts.loads.fits import Fit, FrameFits
+from jaxeit.contacts.loads.fits.comparison import evidences, log_evidence
+from jaxeit.contacts.loads.fits.kinds import Fit, FrameFits
 from jaxeit.contacts.loads.pressure import (
     LOAD_PARAMETERS,
     MAX_LOADS,
-    Form,
+    LoadForm,
     elongations,
     line,
     pad_rows,
@@ -147,7 +147,9 @@ LONG = SPOT.at[4:].set(jnp.array([0.02, 0.01]))
 
 def rows(*loads):
     """All rows of parameters, and their forms."""
-    forms = [Form.LONG if one[4:].any() else Form.ROUND for one in loads] + [Form.ABSENT] * (MAX_LOADS - len(loads))
+    forms = [LoadForm.LONG if one[4:].any() else LoadForm.ROUND for one in loads] + [LoadForm.ABSENT] * (
+        MAX_LOADS - len(loads)
+    )
     return jnp.stack([*loads, *[SPOT] * (MAX_LOADS - len(loads))]), jnp.array(forms)
 
 

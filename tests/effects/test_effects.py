@@ -63,7 +63,7 @@ def _everything(model, key):
 def _history(model, family, series, key, stream=None):
     mine = fx.chosen(model.effects, family, stream)
     pattern = model.pattern if stream is fx.StreamKind.EIT else model.pattern[:0]
-    line = fx.Line(key, jnp.asarray(0.01), jnp.ones(len(series)), jnp.zeros(len(series)), pattern)
+    line = fx.HistoryInputs(key, jnp.asarray(0.01), jnp.ones(len(series)), jnp.zeros(len(series)), pattern)
     return fx.history(mine, series, fx.history_start(mine, series[0]), line)[0]
 
 

@@ -187,7 +187,7 @@ def test_what_heat_does_leaks_away_whatever_the_order_in_the_scene():
     ):
         mine = fx.chosen(effects, fx.AbstractPneumaticEffect)
         start = fx.history_start(mine, jnp.zeros(1))
-        line = fx.Line(jax.random.key(0), jnp.asarray(STEP), hot, 0 * hot, jnp.zeros((0, 4), int))
+        line = fx.HistoryInputs(jax.random.key(0), jnp.asarray(STEP), hot, 0 * hot, jnp.zeros((0, 4), int))
         shown.append(fx.history(mine, jnp.zeros((4000, 1)), start, line)[0][:, 0])
     np.testing.assert_array_equal(*shown)
     assert float(shown[0][0]) > 300

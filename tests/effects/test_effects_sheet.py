@@ -43,7 +43,7 @@ def _ratio(effects, sheet):
 
 def _line(interval):
     none = jnp.zeros(0)
-    return fx.Line(jax.random.key(0), jnp.asarray(interval), none, none, jnp.zeros((0, 4), int))
+    return fx.HistoryInputs(jax.random.key(0), jnp.asarray(interval), none, none, jnp.zeros((0, 4), int))
 
 
 @partial(jax.jit, static_argnames="blocks")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import calib
+from calib.calibration.application.places_in_space import normals_in_space, pad_centres, points_in_space
 from calib.calibration.localisation.contact_tracks import TRACK_ARRAYS
-from calib.calibration.places_in_space import normals_in_space, pad_centres, points_in_space
 from calib.cli import main
 from calib.export.mcap_messages import turn_to
 from calib.export.mcap_writer import topic_names

@@ -422,7 +422,7 @@ def test_a_reader_that_leaves_ends_a_command_quietly(words, good):
 @pytest.mark.parametrize("error", ["MemoryError()", "RuntimeError('RESOURCE_EXHAUSTED: Out of memory')"])
 def test_too_little_memory_is_one_line(error):
     code = (
-        "import sys, calib.cli.commands.doctor_command as command\n"
+        "import sys, calib.cli.commands.skins.doctor_command as command\n"
         f"def run(args): raise {error}\n"
         "command.run = run\n"
         "from calib.cli import main; sys.exit(main(['doctor']))"

@@ -7,7 +7,7 @@ import pytest
 import jaxeit as je
 from jaxeit.imaging.hyperparameters import Spectrum
 from jaxeit.imaging.methods import Problem
-from jaxeit.imaging.noise import noise_weight
+from jaxeit.imaging.readings.noise import noise_weight
 
 STD = 2e-6
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxeit.imaging.missing import DenseRows, Missing, PairRows, completed_sums, correlated, lost_by, removed
+from jaxeit.imaging.readings.missing import DenseRows, Missing, PairRows, completed_sums, correlated, lost_by, removed
 from jaxeit.linalg.array_libraries import JAX, NUMPY
 
 READINGS, PAIRS, BASIS = 14, 7, 9

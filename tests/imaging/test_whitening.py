@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from jaxeit.imaging.whitening import whitened_readings
+from jaxeit.imaging.readings.whitening import whitened_readings
 
 STD = np.geomspace(2e-6, 2e-5, 550)
 

@@ -11,8 +11,8 @@ import pytest
 
 import jaxeit as je
 from calib.bench import BenchError, Footprint, RandomScenes
-from calib.bench.random_scenes import draw_contacts
-from calib.bench.scene_frames import SceneFrames
+from calib.bench.training.random_scenes import draw_contacts
+from calib.bench.training.scene_frames import SceneFrames
 from calib.cli import main
 from calib.learning import procedure, training
 from calib.learning.procedure import train_proposal

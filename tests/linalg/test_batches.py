@@ -10,8 +10,9 @@ from jax.extend.backend import backends
 
 import jaxeit as je
 from jaxeit._compile import compiler_options
-from jaxeit.linalg import NestedDissection, SparsityPattern, batches, nested_dissection
-from jaxeit.linalg.batches import MIN_BATCH, eliminated_lanes, lane_count, lane_plan, unrolled_levels
+from jaxeit.linalg import NestedDissection, SparsityPattern
+from jaxeit.linalg.multifrontal import batches, nested_dissection
+from jaxeit.linalg.multifrontal.batches import MIN_BATCH, eliminated_lanes, lane_count, lane_plan, unrolled_levels
 
 from ..helpers import skin_of
 from .test_solvers import SHAPES, as_pattern, relative, square_sheet

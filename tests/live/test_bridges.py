@@ -288,7 +288,7 @@ STREAMS = ["--eit", "tcp://127.0.0.1:1", "--pressure", "tcp://127.0.0.1:1"]
 )
 def test_what_is_not_installed_is_said(option, missing, words, calibration, monkeypatch, capsys):
     monkeypatch.setattr("calib.calibration.load_calibration", lambda path: calibration)
-    monkeypatch.setattr("calib.cli.commands.live_command._planned", lambda args, calibration: (None, []))
+    monkeypatch.setattr("calib.cli.commands.calibrations.live_command._planned", lambda args, calibration: (None, []))
     monkeypatch.setitem(sys.modules, missing, None)
     assert main(["live", "--calibration", "c.h5", *STREAMS, option]) == 2
     (line,) = capsys.readouterr().err.splitlines()

@@ -22,8 +22,8 @@ import calib
 import jaxeit as je
 from benchmarks import bench_live
 from calib.bench import Bench, Timing, simulate
+from calib.calibration.application.force_maps import ForceModel, fused
 from calib.calibration.evaluation import Evaluation
-from calib.calibration.force_maps import ForceModel, fused
 from calib.calibration.localisation.contact_tracks import PAD_SHARE, NotFollowed, prepare_calibrated_tracker
 from calib.check.placement import NOTE
 from calib.cli import main
@@ -34,10 +34,10 @@ from calib.live import engine as live_engine, loop as live_module
 from calib.live.engine import PREPARING, Engine, FrameForces, FramePrograms, ReceivedFrame, RestAverage
 from calib.live.follower import PIECES, LiveFollower
 from calib.live.loop import FrameQueue, LiveControl, LiveError, LiveSettings, _tell_state, run_live
-from calib.live.page import MAX_CONNECTIONS, Page
-from calib.live.presentation import Presentation, present
 from calib.live.results import TouchEstimates
 from calib.live.scan_control import ScanDirector, prepare_director
+from calib.live.views.page import MAX_CONNECTIONS, Page
+from calib.live.views.presentation import Presentation, present
 from calib.record.broadcast import MAX_LISTENERS, Broadcaster, host_and_port
 from calib.record.device import SimulatedDevice, frame_packets, recording_packets
 from calib.record.plan import StreamPlan
@@ -969,7 +969,7 @@ def test_a_page_on_the_port_of_http_is_reached_by_its_bare_name(page, monkeypatc
     """Browsers leave out port 80 in Host and Origin."""
     own = {"Host": "localhost", "Origin": "http://localhost"}
     assert fetch(page, "/", headers=own)[1].status == 403  # on any other port it is another site
-    monkeypatch.setattr("calib.live.page.HTTP_PORT", page.server_address[1])
+    monkeypatch.setattr("calib.live.views.page.HTTP_PORT", page.server_address[1])
     assert fetch(page, "/", headers=own)[1].status == 200
     assert fetch(page, "/tare", method="POST", headers=own)[1].status == 200
     assert fetch(page, "/", headers={"Host": "[::1]"})[1].status == 200

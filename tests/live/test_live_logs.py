@@ -13,7 +13,7 @@ from calib.fitting.fields import GaussianProcess
 from calib.fitting.logs import LogTracker
 from calib.live.engine import ReceivedFrame
 from calib.live.log_engine import LogEngine
-from calib.live.page import page_scene
+from calib.live.views.page import page_scene
 from calib.session import open_session
 
 from ..place_logs import place_log, write_place_log

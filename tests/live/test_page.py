@@ -17,9 +17,9 @@ from calib.calibration.localisation.ellipses import INSIDE_90, confidence_ellips
 from calib.calibration.logs.calibration import LogCalibration
 from calib.calibration.press_examples import PressExamples
 from calib.live.loop import LiveControl
-from calib.live.page import Page, whole_page
-from calib.live.page_scene import electrode_outlines, full_scales, layer_maps, page_scene, rounded_up
 from calib.live.results import FrameResult, KindEstimate, LogResult, TouchEstimates
+from calib.live.views.page import Page, whole_page
+from calib.live.views.page_scene import electrode_outlines, full_scales, layer_maps, page_scene, rounded_up
 from jaxeit.contacts import LoadSettings
 from jaxeit.tracking import GainField, LearnedLayer
 from tests.browser import Browser, browser_path
@@ -158,10 +158,10 @@ def test_full_colours_are_those_of_presses_of_the_calibration(skin, monkeypatch)
     monkeypatch.setattr(type(recon), "__call__", lambda self, dv: 1e-3 * np.asarray(dv), raising=False)
     shown = PressExamples(np.array([[1.0, -2.3, 0.5]]), np.zeros((1, 4)), np.zeros((1, 2)), np.array([7.2]))
     monkeypatch.setattr(
-        "calib.live.page_scene.force_map",
+        "calib.live.views.page_scene.force_map",
         lambda *_: stand_in(object, map=stand_in(object, force=jnp.array([[1.0, 2.6, 99.0]]))),
     )
-    monkeypatch.setattr("calib.live.page_scene.replace", lambda found, **_: found)
+    monkeypatch.setattr("calib.live.views.page_scene.replace", lambda found, **_: found)
     calibration = stand_in(Calibration, skin=skin, recon=recon, examples=shown)
     assert full_scales(calibration) == (30e3, pytest.approx(3e-3))  # 2.6 of 3.6 N, twice, on 2 cm2: 26 kPa
 
@@ -211,9 +211,9 @@ def messages(page, count):
 def test_a_viewer_is_told_the_layer_once_and_again_when_contacts_have_taught_it(page, calibration, monkeypatch):
     drawn = []
     monkeypatch.setattr(
-        "calib.live.page.layer_maps", lambda layer, _: drawn.append(layer) or {"contacts": layer.contacts}
+        "calib.live.views.page.layer_maps", lambda layer, _: drawn.append(layer) or {"contacts": layer.contacts}
     )
-    monkeypatch.setattr("calib.live.page.KEEP_ALIVE_INTERVAL", 0.1)
+    monkeypatch.setattr("calib.live.views.page.KEEP_ALIVE_INTERVAL", 0.1)
     told = messages(page, 8)
     page.control.layer = some_layer(calibration, contacts=0)  # nothing was learned
     assert next(told)["layer"] is None

@@ -28,7 +28,7 @@ def test_without_rerun_the_option_says_what_to_install(monkeypatch, tmp_path, ca
 def view():
     """The module, where rerun is installed."""
     pytest.importorskip("rerun")
-    from calib.live import rerun_view  # noqa: PLC0415  it needs the optional extra
+    from calib.live.views import rerun_view  # noqa: PLC0415  it needs the optional extra
 
     return rerun_view
 

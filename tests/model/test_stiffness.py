@@ -10,7 +10,7 @@ from scipy.sparse.linalg import spsolve
 
 import jaxeit as je
 from jaxeit.linalg.small_matrices import product_by_loops, stacked_product
-from jaxeit.model.stiffness import _balanced
+from jaxeit.model.matrix.stiffness import _balanced
 
 from ..helpers import square_model
 
@@ -55,7 +55,7 @@ def test_products_are_sums_over_the_elements(small, basis, monkeypatch):
     lines, rows, _ = image.stiffness.entry.shape
     assert lines > 5
     assert lines % 5  # batches of five lines, the last one not full
-    monkeypatch.setattr("jaxeit.model.stiffness.BATCH_ROWS", 5 * rows)
+    monkeypatch.setattr("jaxeit.model.matrix.stiffness.BATCH_ROWS", 5 * rows)
     wanted = _by_hand(small, image, potential)
     np.testing.assert_allclose(_products(image, potential), wanted, atol=1e-13 * np.abs(wanted).max())
 
@@ -78,7 +78,7 @@ def test_both_ways_to_multiply_agree(small, monkeypatch):
     image, potential = je.Elements().on(small), _fields(small)
     found = []
     for few in (0, 100):
-        monkeypatch.setattr("jaxeit.model.stiffness.MAX_LOOPED_ENTRIES", few)
+        monkeypatch.setattr("jaxeit.model.matrix.stiffness.MAX_LOOPED_ENTRIES", few)
         monkeypatch.setattr("jaxeit.linalg.small_matrices.MIN_LOOPED_MULTIPLICATIONS", 0)
         found.append(np.asarray(_products(image, potential)))
     np.testing.assert_allclose(*found, atol=1e-14 * np.abs(found[0]).max())

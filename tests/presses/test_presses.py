@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from calib.presses.corrections import LowPass, PreOnly, TwoSided
-from calib.presses.detection import DetectionLimits, find_presses, noise_level
 from calib.presses.means import dominant_pad, hold_positions, press_means
-from calib.presses.onsets import crossing, onset_delays
 from calib.presses.pooled import PooledPresses, PressData
 from calib.presses.samples import press_samples
 from calib.presses.streams import ArrayStream, PressError, index_ranges, resample
-from calib.presses.times import PressTimes, reject
-from calib.presses.windows import WindowLengths, press_windows, reject_without_samples
+from calib.presses.timing.detection import DetectionLimits, find_presses, noise_level
+from calib.presses.timing.onsets import crossing, onset_delays
+from calib.presses.timing.times import PressTimes, reject
+from calib.presses.timing.windows import WindowLengths, press_windows, reject_without_samples
 from calib.session.units import SECOND
 from tests.helpers import stand_in
 

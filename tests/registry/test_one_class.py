@@ -197,7 +197,7 @@ import calib
 import jaxeit as je
 from calib.cli import main
 from calib.fitting import CURVES, FIELDS
-from calib.live.page_scene import electrode_outlines
+from calib.live.views.page_scene import electrode_outlines
 from calib.report.figures.parts import bare_figure, draw_electrodes
 from calib.session.importers import importers
 

@@ -23,12 +23,12 @@ from calib.fitting.fields import FittedField, PadEdge, geometry_of, log_gain, si
 from calib.report import pictures
 from calib.report.document import write_report
 from calib.report.figures import parts
-from calib.report.figures.contact_layer import layer_maps
-from calib.report.figures.curved_sheet import curved_figure
 from calib.report.figures.force_series import ForceSeries, force_series_figure
 from calib.report.figures.pads import curves_figure, gain_figure, loops_figure
 from calib.report.figures.parts import ReportError, png
 from calib.report.figures.presses import localisation_figure, sensitivity_figure
+from calib.report.figures.skin.contact_layer import layer_maps
+from calib.report.figures.skin.curved_sheet import curved_figure
 from jaxeit.contacts.loads.settings import LoadSettings
 from jaxeit.tracking import ContactLaw, GainField, LearnedLayer
 from tests.helpers import skin_of

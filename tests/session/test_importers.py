@@ -14,9 +14,9 @@ import jaxeit as je
 from calib.calibration.logs.procedure import calibrate_logs, render_log
 from calib.cli import main
 from calib.session import SessionError, Status, file_hash, importers, open_session
-from calib.session.importers import About, CsvImporter, ImportReport, add_arguments, import_csv, run
-from calib.session.importers.columns import parse_stream, parse_time
-from calib.session.importers.sentinels import sentinel_warnings
+from calib.session.importers import CsvImporter, ImportReport, StatedFacts, add_arguments, import_csv, run
+from calib.session.importers.tables.columns import parse_stream, parse_time
+from calib.session.importers.tables.sentinels import sentinel_warnings
 
 from ..helpers import REAL_DATA
 
@@ -28,7 +28,7 @@ def load(*words: object, folder: Path, sort: bool = False) -> ImportReport:
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     args = parser.parse_args(["csv", *map(str, words), "-o", str(folder / "s.h5"), *(["--sort"] if sort else [])])
-    return CsvImporter.convert(args, Path(args.output), About())
+    return CsvImporter.convert(args, Path(args.output), StatedFacts())
 
 
 def table(folder: Path, text: str, name: str = "log.csv") -> Path:
@@ -426,7 +426,7 @@ def test_a_module_of_a_format_that_raises_is_named(tmp_path, monkeypatch, capsys
     [
         ("no_such_module:Format", "cannot be imported (No module named 'no_such_module')"),
         (f"{__name__}:NoSuchFormat", "has no attribute 'NoSuchFormat'"),
-        (f"{__name__}:About", "is not a concrete class derived from AbstractImporter"),
+        (f"{__name__}:StatedFacts", "is not a concrete class derived from AbstractImporter"),
         ("calib.session.importers:AbstractTableImporter", "is not a concrete class derived from AbstractImporter"),
     ],
 )

@@ -59,7 +59,7 @@ def test_histories_continue_from_step_to_step(skin):
         state, readings = steps(state, contacts([load], PLACES[:1]))
         found.append(readings)
     model, still = felt.model, jnp.zeros(len(loads))
-    line = fx.Line(jax.random.key(0), jnp.asarray(1 / RATE), still, still, model.pattern[:0])
+    line = fx.HistoryInputs(jax.random.key(0), jnp.asarray(1 / RATE), still, still, model.pattern[:0])
 
     def series(family, values):
         mine = fx.chosen(model.effects, family)

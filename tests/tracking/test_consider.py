@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 import jaxeit as je
-from jaxeit.contacts.loads.pressure import Form, line_shapes, shape_directions
+from jaxeit.contacts.loads.pressure import LoadForm, line_shapes, shape_directions
 from jaxeit.model.gaussian_field import field_modes
 from jaxeit.tracking import prepare_tracker
 from jaxeit.tracking.belief.consider import ConsiderErrors
@@ -27,7 +27,7 @@ def test_moments_of_a_round_load_are_those_of_single_frames():
     one = jnp.array(load(0.1, 0.1, 5.0))
     points = jnp.stack(jnp.meshgrid(jnp.linspace(0, 0.2, 81), jnp.linspace(0, 0.2, 81)), -1)
     found = line_shapes(one, points, MIN_HALF_LENGTH)
-    wanted = shape_directions(one[None], jnp.array([Form.ROUND]), points)
+    wanted = shape_directions(one[None], jnp.array([LoadForm.ROUND]), points)
     np.testing.assert_allclose(found, wanted, atol=1e-3 * float(jnp.abs(wanted).max()))
     area = 0.0025**2
     np.testing.assert_allclose(found.sum((0, 1)) * area, 0, atol=5e-3)

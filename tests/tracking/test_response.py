@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from jaxeit.imaging.whitening import whitened_readings
+from jaxeit.imaging.readings.whitening import whitened_readings
 from jaxeit.model.bases import Elements
 from jaxeit.model.sensitivity import pair_jacobian
 from jaxeit.tracking import prepare_tracker

@@ -13,7 +13,7 @@ import numpy as np
 import jaxeit as je
 from jaxeit.toml import TomlTable, parse_toml
 
-from ...fitting.cross_validation.selection import Candidate, Choice
+from ...fitting.cross_validation.selection import Candidate, ModelChoice
 from ...fitting.curves import CURVES, AbstractCurve, FittedCurve, Linear
 from ...fitting.fields import FIELDS, AbstractField, FittedField, Geometry
 from ...fitting.fields.base import restore_field
@@ -24,13 +24,13 @@ from ...session import Archive
 from ..evaluation import Evaluation
 from ..hysteresis_loops import Loops
 from ..localisation.electrode_places import PlacedElectrodes
-from ..localisation.law_arrays import law_arrays, law_from
-from ..localisation.layer_arrays import layer_arrays, layer_from
+from ..localisation.learned.law_arrays import law_arrays, law_from
+from ..localisation.learned.layer_arrays import layer_arrays, layer_from
 from ..localisation.locators import AbstractLocator, locator_from_numbers, locator_numbers
 from ..press_examples import PressExamples
 from ..recalibration.changes import Recalibration
-from ..recipe import Recipe
-from ..recipe_text import read_imaging, read_processing
+from ..recipes.recipe import Recipe
+from ..recipes.text import read_imaging, read_processing
 from .arrays import shaped
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ def _require_sealed(archive: Archive) -> None:
         raise ValueError("they were changed after the calibration was saved")
 
 
-def describe(recipe: Recipe, recon: je.imaging.AbstractReconstructor, choice: Choice) -> dict[str, str]:
+def describe(recipe: Recipe, recon: je.imaging.AbstractReconstructor, choice: ModelChoice) -> dict[str, str]:
     """Provenance of a calibration: its recipe, and the choices that were made by cross-validation."""
     return {
         "curve": CURVES.name_of(choice.curve),

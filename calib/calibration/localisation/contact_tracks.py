@@ -24,8 +24,8 @@ from jaxeit.tracking import (
     Tracking,
 )
 
+from ..application.frame_blocks import FrameBlocks
 from ..calibration import Calibration
-from ..frame_blocks import FrameBlocks
 from .load_windows import LOAD_FIDELITY
 from .press_images import taken_for_even
 from .quiet_frames import ENOUGH_FRAMES, QuietFrames
@@ -229,7 +229,7 @@ class ContactTracks:
         )
 
 
-class About(NamedTuple):
+class TrackArray(NamedTuple):
     """An array with one row for each contact of a frame: shape of a row, unit, meaning and type."""
 
     shape: tuple[int, ...]
@@ -239,15 +239,15 @@ class About(NamedTuple):
 
 
 TRACK_ARRAYS = {
-    "time": About((), "ns", "of the frame, since time_epoch_utc", "i8"),
-    "number": About((), "1", "of the contact, which it keeps while it lives", "i8"),
-    "position": About((2,), "m", "in the sheet's flat coordinates; of an edge, its middle"),
-    "position_covariance": About((2, 2), "m2", "of the position"),
-    "width": About((), "m", "standard deviation of the load, across an edge"),
-    "force": About((), "N", "of the contact"),
-    "force_se": About((), "N", "standard error of the force"),
-    "half": About((2,), "m", "from the middle of an edge to its end; zero for other contacts"),
-    "velocity": About((2,), "m/s", "of the position"),
+    "time": TrackArray((), "ns", "of the frame, since time_epoch_utc", "i8"),
+    "number": TrackArray((), "1", "of the contact, which it keeps while it lives", "i8"),
+    "position": TrackArray((2,), "m", "in the sheet's flat coordinates; of an edge, its middle"),
+    "position_covariance": TrackArray((2, 2), "m2", "of the position"),
+    "width": TrackArray((), "m", "standard deviation of the load, across an edge"),
+    "force": TrackArray((), "N", "of the contact"),
+    "force_se": TrackArray((), "N", "standard error of the force"),
+    "half": TrackArray((2,), "m", "from the middle of an edge to its end; zero for other contacts"),
+    "velocity": TrackArray((2,), "m/s", "of the position"),
 }
 
 

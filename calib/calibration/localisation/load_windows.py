@@ -20,7 +20,7 @@ from jaxeit.registry import SettingError
 
 from ...presses.streams import finite_mean
 from ..calibration import Calibration
-from .learned_loads import learned_loads
+from .learned.loads import learned_loads
 from .press_images import fit_untouched_sheet
 from .quiet_frames import QuietFrames
 

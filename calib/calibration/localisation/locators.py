@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 import jaxeit as je
-from jaxeit.kinds import require_kind
+from jaxeit.messages.kinds import require_kind
 from jaxeit.registry import Registry, SettingError, limited, require_limits
 
 from ...fitting.fields import Places, single_places

@@ -13,7 +13,7 @@ import jaxeit as je
 from ...check.placement import PLACEMENT_FIDELITY, placement_note
 from ...fitting.fields import Places
 from ...presses.pooled import PooledPresses
-from ..recipe import Recipe
+from ..recipes.recipe import Recipe
 from .locators import AbstractLocator, locate
 
 REPORTED_ESTIMATORS: Mapping[str, je.metrics.AbstractEstimator] = {

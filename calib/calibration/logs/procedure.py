@@ -15,7 +15,7 @@ import numpy as np
 
 import jaxeit as je
 from jaxeit.budget import current_budget
-from jaxeit.kinds import require_kind
+from jaxeit.messages.kinds import require_kind
 
 from ...check.acceptance import accept
 from ...check.logs.blocks import NOT_SIGNALS, signal_name
@@ -39,8 +39,8 @@ from ...presses.streams import resample
 from ...session import Session, SessionError, Stream, write_archive
 from ...session.given import call_on, require_session, sessions_of
 from ..fitted_sessions import FITTED_NOTE, is_fitted, require_each_once
-from ..recipe import Recipe, recipe_or_default
-from ..recipe_text import AUTO_CURVES, SWITCHES
+from ..recipes.recipe import Recipe, recipe_or_default
+from ..recipes.text import AUTO_CURVES, SWITCHES
 from .calibration import LogCalibration
 from .evaluation import LogEvaluation, log_evaluation
 from .storage import location_name

@@ -11,11 +11,11 @@ from scipy.spatial.distance import cdist
 
 from ...presses.means import press_means
 from ...presses.streams import MAD_TO_SIGMA, finite_mean, true_runs
-from ...presses.windows import PressWindows
+from ...presses.timing.windows import PressWindows
 from ...session import Session, Stream
 from ...session.units import SECOND
+from ..application.force_maps import force_model, is_loaded
 from ..calibration import Calibration
-from ..force_maps import force_model, is_loaded
 
 BIN = SECOND // 10  # over which pressures are averaged
 REST = 5 * BIN  # averaged before and after a contact

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxeit as je
-from jaxeit.kinds import require_kind
+from jaxeit.messages.kinds import require_kind
 
 from ...check.acceptance import accept
 from ...fitting.curves.fitted import predict_pads
@@ -27,9 +27,9 @@ from ...fitting.pad_gains import gain_slopes
 from ...presses.table import measure, require_skin
 from ...session import Session, SessionError
 from ...session.given import require_session
+from ..application.force_maps import USED_PARTS, ForceModel, force_model, unmoved_forces
 from ..calibration import Calibration
 from ..fitted_sessions import SAME_NOTE, holds_presses, is_fitted, require_not_moved_by
-from ..force_maps import USED_PARTS, ForceModel, force_model, unmoved_forces
 from ..given import require_calibration
 from ..localisation.press_images import Imager
 from ..logs.calibration import LogCalibration

@@ -11,7 +11,7 @@ from ...presses.means import press_means
 from ...session import Stream
 from ...session.units import SECOND
 from ..evidence import PressEvidence
-from ..parts import MIN_ROWS, Part, flagged_part
+from ..parts import MIN_ROWS, RowRange, flagged_part
 from ..report import ChannelTable, Finding, Severity, listed
 from .contact_places import locate_contacts
 from .contradictions import MIN_CONTRADICTION
@@ -120,7 +120,7 @@ def _moves(middle: np.ndarray) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
 
 def _mistake(
     tried: dict[str, np.ndarray], site: np.ndarray, contacts: np.ndarray, pitch: float
-) -> tuple[str, Part | None, float] | None:
+) -> tuple[str, RowRange | None, float] | None:
     """The mistake, and the part of the presses, that brings the places (rows, 2) nearest to the contacts, if any does.
 
     ``tried`` are the places with each mistake undone. Returns its name, the part (None: all presses) and the median
@@ -143,10 +143,10 @@ def _mistake(
     return None
 
 
-def _best_part(gain: np.ndarray) -> Part:
+def _best_part(gain: np.ndarray) -> RowRange:
     """The first or the last part of the rows (rows,) with the largest sum of gains."""
     rows = len(gain)
-    parts = [Part(row, first) for row in range(MIN_ROWS, rows - MIN_ROWS + 1) for first in (True, False)]
+    parts = [RowRange(row, first) for row in range(MIN_ROWS, rows - MIN_ROWS + 1) for first in (True, False)]
     return max(parts, key=lambda part: float(gain[part.mask(rows)].sum()))
 
 

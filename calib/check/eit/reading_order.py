@@ -62,7 +62,7 @@ def predict_readings(transfer: np.ndarray, pattern: np.ndarray, mixing: sp.csr_a
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
+class OrderHypothesis:
     """A mistake that the recorder may have made, and what its readings then follow.
 
     ``pattern`` (rows, 4), and the ``order`` (readings,) of what is read by it; None: as it is.
@@ -127,7 +127,7 @@ def check_order(
         mixing: readings as sums of rows of the pattern (readings, rows); default: each row is one.
     """
 
-    def predicted(hypothesis: Hypothesis) -> np.ndarray:
+    def predicted(hypothesis: OrderHypothesis) -> np.ndarray:
         found: np.ndarray = current * predict_readings(transfer, hypothesis.pattern, mixing)
         kept: np.ndarray = (found if hypothesis.order is None else found[hypothesis.order])[good]
         return kept
@@ -185,7 +185,7 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float(a @ b / size) if size > 0 else 0.0
 
 
-def _signed_correlation(v: np.ndarray, model: np.ndarray, hypothesis: Hypothesis) -> float:
+def _signed_correlation(v: np.ndarray, model: np.ndarray, hypothesis: OrderHypothesis) -> float:
     if not hypothesis.magnitude:
         return _correlation(v, model)
     return _correlation(np.abs(v), np.abs(model)) if _one_sign(v, model) else 0.0
@@ -197,14 +197,14 @@ def _hypotheses(
     electrodes: int,
     positions: np.ndarray | None,
     usual: np.ndarray | None,
-) -> Iterator[Hypothesis]:
+) -> Iterator[OrderHypothesis]:
     """All hypotheses, from the simplest to the most unusual; the first is the recorded order itself."""
-    yield Hypothesis(
+    yield OrderHypothesis(
         "every sign is reversed (drive pairs, sense pairs or the amplifier's inputs)",
         "exchange sense+ and sense- in the pattern, or negate the voltages at import",
         pattern,
     )
-    yield Hypothesis(
+    yield OrderHypothesis(
         "the recorder stored magnitudes without sign",
         "record the signed (in-phase) voltage, not its amplitude",
         pattern,
@@ -220,15 +220,17 @@ def _hypotheses(
 REORDER_REMEDY = "write the rows of the pattern in the order in which the readings come"
 
 
-def _reading_orders(pattern: np.ndarray, mixing: sp.csr_array | None, usual: np.ndarray | None) -> Iterator[Hypothesis]:
+def _reading_orders(
+    pattern: np.ndarray, mixing: sp.csr_array | None, usual: np.ndarray | None
+) -> Iterator[OrderHypothesis]:
     if usual is not None and usual.shape == pattern.shape and (usual != pattern).any():
-        yield Hypothesis(
+        yield OrderHypothesis(
             "the readings are in the order of the skin's protocol, not of the recorded pattern",
             "write the skin's own pattern into the session",
             usual,
         )
     backwards = np.arange(count_readings(pattern, mixing))[::-1]
-    yield Hypothesis("the readings of a frame come in reversed order", REORDER_REMEDY, pattern, backwards)
+    yield OrderHypothesis("the readings of a frame come in reversed order", REORDER_REMEDY, pattern, backwards)
     if mixing is not None:  # a reading has no pair of its own to be ordered by
         return
     drive, sense = _rank(pattern[:, :2]), _rank(pattern[:, 2:])
@@ -238,7 +240,7 @@ def _reading_orders(pattern: np.ndarray, mixing: sp.csr_array | None, usual: np.
         "the readings come sense electrode by sense electrode": np.lexsort((drive, pattern[:, 2])),
     }
     for what, order in orders.items():
-        yield Hypothesis(what, REORDER_REMEDY, pattern, order)
+        yield OrderHypothesis(what, REORDER_REMEDY, pattern, order)
 
 
 def _rank(pairs: np.ndarray) -> np.ndarray:
@@ -250,17 +252,17 @@ def _rank(pairs: np.ndarray) -> np.ndarray:
 RENUMBER_REMEDY = "reorder the electrodes in the skin's TOML file, or the wires"
 
 
-def _renumbered(pattern: np.ndarray, electrodes: int) -> Iterator[Hypothesis]:
+def _renumbered(pattern: np.ndarray, electrodes: int) -> Iterator[OrderHypothesis]:
     number = np.arange(electrodes)
     for first in range(1, electrodes):
         what = f"electrodes are counted from another one: the recorder's 0 is the skin's {first}"
-        yield Hypothesis(what, RENUMBER_REMEDY, ((number + first) % electrodes)[pattern])
+        yield OrderHypothesis(what, RENUMBER_REMEDY, ((number + first) % electrodes)[pattern])
     for first in range(electrodes):
         what = f"electrodes are numbered backwards: the recorder's 0 is the skin's {first}"
-        yield Hypothesis(what, RENUMBER_REMEDY, ((first - number) % electrodes)[pattern])
+        yield OrderHypothesis(what, RENUMBER_REMEDY, ((first - number) % electrodes)[pattern])
 
 
-def _grid_numberings(pattern: np.ndarray, positions: np.ndarray | None) -> Iterator[Hypothesis]:
+def _grid_numberings(pattern: np.ndarray, positions: np.ndarray | None) -> Iterator[OrderHypothesis]:
     """Numberings of a grid of electrodes, row by row and in a snake, from every corner."""
     if positions is None:
         return
@@ -277,20 +279,26 @@ def _grid_numberings(pattern: np.ndarray, positions: np.ndarray | None) -> Itera
                 snake[1::2] = snake[1::2, ::-1]
                 start = f"starting at the skin's electrode {plain[0, 0]}"
                 remedy = f'{RENUMBER_REMEDY} ("order" in [electrodes.grid])'
-                yield Hypothesis(f"electrodes are numbered {name}, all alike, {start}", remedy, plain.ravel()[pattern])
-                yield Hypothesis(f"electrodes are numbered {name} in a snake, {start}", remedy, snake.ravel()[pattern])
+                yield OrderHypothesis(
+                    f"electrodes are numbered {name}, all alike, {start}", remedy, plain.ravel()[pattern]
+                )
+                yield OrderHypothesis(
+                    f"electrodes are numbered {name} in a snake, {start}", remedy, snake.ravel()[pattern]
+                )
 
 
-def _shifted_frames(pattern: np.ndarray, readings: int) -> Iterator[Hypothesis]:
+def _shifted_frames(pattern: np.ndarray, readings: int) -> Iterator[OrderHypothesis]:
     for start in range(1, min(readings, MAX_SHIFTS)):
         what = f"each frame starts at reading {start} of the pattern"
-        yield Hypothesis(what, "synchronise the recorder with the scan", pattern, np.roll(np.arange(readings), -start))
+        yield OrderHypothesis(
+            what, "synchronise the recorder with the scan", pattern, np.roll(np.arange(readings), -start)
+        )
 
 
-def _swapped(pattern: np.ndarray, electrodes: int) -> Iterator[Hypothesis]:
+def _swapped(pattern: np.ndarray, electrodes: int) -> Iterator[OrderHypothesis]:
     for i in range(min(electrodes, MAX_SWAPPED_ELECTRODES)):
         for j in range(i + 1, min(electrodes, MAX_SWAPPED_ELECTRODES)):
             number = np.arange(electrodes)
             number[[i, j]] = j, i
             what = f"electrodes {i} and {j} are exchanged"
-            yield Hypothesis(what, f"exchange the wires of electrodes {i} and {j}", number[pattern])
+            yield OrderHypothesis(what, f"exchange the wires of electrodes {i} and {j}", number[pattern])

@@ -8,7 +8,7 @@ import numpy as np
 import jaxeit as je
 
 from ...presses.streams import finite_mean, true_runs
-from ...presses.times import PressColumns
+from ...presses.timing.times import PressColumns
 from ...session import Session, Status
 from ...session.units import SECOND
 from ..evidence import PressEvidence

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..parts import Part, flagged_part, stepped_part
+from ..parts import RowRange, flagged_part, stepped_part
 from ..report import Finding, Severity
 from .blocks import LOG_BLOCKS, LogBlocks, usual
 from .following import RELATED_CORRELATION, has_usual_variation
@@ -29,7 +29,7 @@ class _Change(NamedTuple):
     gains of the wrong stream, that of the part over that of the rest; below zero: the sign is another one.
     """
 
-    part: Part
+    part: RowRange
     times: np.ndarray
     of_force: bool
     ratio: float
@@ -109,7 +109,7 @@ def _gain_change(log: LogBlocks, channel: int) -> _Change | None:
         if ratio is None or abs(np.log(ratio)) <= np.log(MIN_RATIO):
             continue
         if all(has_usual_variation(kept[side], spreads) for side in sides):
-            return _Change(Part(row, False), log.starts[used], of_force, ratio)
+            return _Change(RowRange(row, False), log.starts[used], of_force, ratio)
     return None
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import jaxeit as je
 
 from ...presses.streams import finite_mean, index_ranges, resample, true_runs
-from ...presses.times import PressColumns
+from ...presses.timing.times import PressColumns
 from ...session import PressTable
 from ...session.units import SECOND
 from ..evidence import PressEvidence

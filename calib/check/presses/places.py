@@ -7,7 +7,7 @@ import numpy as np
 import jaxeit as je
 
 from ...presses.means import hold_positions
-from ...presses.times import select
+from ...presses.timing.times import select
 from ...session import PressTable, Stream
 from ..eit.place_comparison import contact_findings
 from ..evidence import PressEvidence

@@ -6,7 +6,7 @@ import numpy as np
 
 from ...session import PressTable
 from ..evidence import PressEvidence
-from ..parts import Part, stepped_part
+from ..parts import RowRange, stepped_part
 from ..report import Finding, Severity
 
 FORCE, PRESSES = "/streams/force", "/presses"
@@ -59,7 +59,7 @@ def _step_finding(ratio: np.ndarray, times: np.ndarray, start: int) -> Finding |
         return None
     first = bool(abs(np.log(before)) > abs(np.log(after)))
     wrong, right = (before, after) if first else (after, before)
-    when = Part(row, first).text(times, start)
+    when = RowRange(row, first).text(times, start)
     what = f"the force reads {wrong:.3g} times the target of the presses {when}, {right:.3g} times in the others"
     return Finding(Severity.WARNING, FORCE, what, "look for a change of the unit, the gain or the tare at that time")
 

@@ -1,9 +1,9 @@
 """Check the presses of a recording: list them, and gather the changes of the streams during each press."""
 
-from ...presses.detection import find_presses
 from ...presses.streams import PressError, recording_end
-from ...presses.times import PressColumns
-from ...presses.windows import press_windows, reject_without_samples
+from ...presses.timing.detection import find_presses
+from ...presses.timing.times import PressColumns
+from ...presses.timing.windows import press_windows, reject_without_samples
 from ...session import Session, SessionError
 from ..evidence import PressEvidence, gather_evidence
 from ..report import Finding, PressSummary, Severity

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage, signal
 
-from ...presses.onsets import OnsetDelay, onset_delays
+from ...presses.timing.onsets import OnsetDelay, onset_delays
 from ...session.units import SECOND
 from ..evidence import PressEvidence
 from ..report import Finding, Severity

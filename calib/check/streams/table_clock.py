@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ...presses.onsets import ramp_delay
 from ...presses.streams import index_ranges
-from ...presses.windows import PressWindows
+from ...presses.timing.onsets import ramp_delay
+from ...presses.timing.windows import PressWindows
 from ...session import PressTable
 from ...session.units import SECOND
 from ..evidence import PressEvidence

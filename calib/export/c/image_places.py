@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 import jaxeit as je
-from jaxeit.kinds import require_kind
+from jaxeit.messages.kinds import require_kind
 
 from ...calibration import Calibration, force_map
 from ...calibration.localisation.locators import CentroidLocator

@@ -1,8 +1,8 @@
 """The numbers of a calibration as its C header needs them.
 
-The image is ``factor P^T W dv``, where P holds the current c times signs (see `jaxeit.imaging.whitening`). With the
-current taken out, ``t' = t / c``, ``factor' = c factor`` and ``T' = c^2 T``, the C program adds and subtracts weighed
-readings.
+The image is ``factor P^T W dv``, where P holds the current c times signs (see `jaxeit.imaging.readings.whitening`).
+With the current taken out, ``t' = t / c``, ``factor' = c factor`` and ``T' = c^2 T``, the C program adds and subtracts
+weighed readings.
 """
 
 from typing import NamedTuple

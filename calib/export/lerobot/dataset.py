@@ -10,8 +10,8 @@ import numpy as np
 
 from jaxeit.notebook import png_of
 
-from ...calibration.application import FORCE_MAP_FORMAT
-from ...calibration.frame_blocks import Progress
+from ...calibration.application.frame_blocks import Progress
+from ...calibration.application.map_files import FORCE_MAP_FORMAT
 from ...session import ArchiveReader, open_archive
 from ...session.errors import problem
 from ...session.given import paths_of

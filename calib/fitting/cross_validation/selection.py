@@ -103,7 +103,7 @@ def _root_mean_squares(mean: float, error: float) -> tuple[float | None, float |
     return float(np.sqrt(mean)), float(np.sqrt(max(mean - error, 0))), float(np.sqrt(mean + error))
 
 
-class Choice(NamedTuple):
+class ModelChoice(NamedTuple):
     """The chosen curve and field, the reason in words, and all candidates (none if there was only one)."""
 
     curve: AbstractCurve
@@ -132,7 +132,7 @@ def choose(
     fields: Sequence[AbstractField | None],
     folds: Folds,
     without: frozenset[int] = NO_FOLDS,
-) -> Choice:
+) -> ModelChoice:
     """The simplest pair of curve and field whose held-out error is not worse than the least; see `simplest`.
 
     The error is the mean over places of the mean square over the samples of the presses, so that all loads of a ramp
@@ -143,13 +143,13 @@ def choose(
     """
     pairs = list(product(curves, fields))
     if len(pairs) == 1:
-        return Choice(*pairs[0], "")
+        return ModelChoice(*pairs[0], "")
     parts = [part for part, choices in (("curve", curves), ("location", fields)) if len(choices) > 1]
     options = [Option(pair, _name(*pair, parts), folds.fit(*pair, without).coefficients) for pair in pairs]
     (curve, field), why, table = simplest(
         " and ".join(parts), options, lambda pair: folds.place_errors(pair[0], pair[1], without), "places"
     )
-    return Choice(curve, field, why, table)
+    return ModelChoice(curve, field, why, table)
 
 
 def nested_selection(

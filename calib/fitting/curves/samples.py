@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxeit.kinds import require_unmasked
+from jaxeit.messages.kinds import require_unmasked
 
 from ..results import FitError
 

@@ -54,7 +54,7 @@ ITERATIONS = 2  # of alternate fits of the gain over places and of the curve
 WAY_PENALTY = 10.0  # effective coefficients that are added for a way over those of the one before it
 
 
-class HeldOut(NamedTuple):
+class HeldOutSamples(NamedTuple):
     """Predictions of fits without the stretch of time of a sample; NaN for samples that are not used.
 
     | field    | meaning                                        | shape | unit |
@@ -85,7 +85,7 @@ class FittedLog:
 
     model: LogModel
     predicted: LogPrediction
-    held_out: HeldOut
+    held_out: HeldOutSamples
     way: Way
     curve: AbstractCurve
     field: AbstractField | None
@@ -220,10 +220,10 @@ class _Problem:
         each = [LogLocation(self.box, _fit_row(gains, k)).gains(self.series.place) for k in range(len(self.train))]
         return np.stack([gain for gain, _ in each]), np.sqrt(np.stack([variance for _, variance in each]))
 
-    def held_out(self, fits: _Fits) -> HeldOut:
+    def held_out(self, fits: _Fits) -> HeldOutSamples:
         """Each used sample as the fit without its fold predicts it; NaN where that fit failed."""
         n, succeeded = len(self.fold), fits.succeeded
-        found = HeldOut(np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, bool))
+        found = HeldOutSamples(np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, bool))
         for row in range(1, len(self.train)):
             if succeeded[row]:
                 _copy(fits, row, self.used & ~self.train[row], found)
@@ -248,7 +248,7 @@ def _fit_row(gains: FittedField, row: int) -> FittedField:
     return found
 
 
-def _copy(fits: _Fits, row: int, rows: np.ndarray, found: HeldOut) -> None:
+def _copy(fits: _Fits, row: int, rows: np.ndarray, found: HeldOutSamples) -> None:
     """Write what one fit predicts for the flagged samples."""
     for part, given in zip(found, (fits.force, fits.error, fits.valid), strict=True):
         part[rows] = given[row, rows]

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from ...calibration.application.places_in_space import normals_in_space, pad_centres, points_in_space
 from ...calibration.calibration import Calibration
 from ...calibration.logs.calibration import LogCalibration
-from ...calibration.places_in_space import normals_in_space, pad_centres, points_in_space
 from ...export.force_map_topics import ForceMapTopics, SkinLayout
 from ...export.mcap_writer import require_frame, topic_prefix
 from ...export.message_sink import AbstractMessageSink

@@ -31,7 +31,7 @@ from .records import (
     unpack_event,
     unpack_pong,
 )
-from .survey import FrameBlock, SequenceAndClock, StreamSurvey, UnpackedBlock
+from .survey import SequenceAndClock, StreamBlock, StreamSurvey, UnpackedBlock
 
 MAX_EVENTS = 100_000
 SIMULATED_LABEL = "the device reports that its values are simulated"
@@ -149,7 +149,7 @@ class _StreamWriter:
         self._writer, self._survey, self._fit, self._epoch = writer, survey, fit, host_epoch
         self._latency = round(survey.latency(fit).ns)
         self.name = survey.plan.name
-        self._tracker, self._block = SequenceAndClock(survey.plan), FrameBlock()
+        self._tracker, self._block = SequenceAndClock(survey.plan), StreamBlock()
         self._segment, self._last = 0, -(2**62)
         self.steps: list[int] = []
         self._declare()
@@ -180,7 +180,7 @@ class _StreamWriter:
 
     def flush(self) -> None:
         """Write the frames that wait in the block."""
-        block, self._block = self._block, FrameBlock()
+        block, self._block = self._block, StreamBlock()
         if not block.payloads:
             return
         batch = UnpackedBlock(block, self._tracker)

@@ -17,7 +17,7 @@ MAX_PONGS = 100_000  # answers to pings that are kept of each stream
 
 
 @dataclass
-class FrameBlock:
+class StreamBlock:
     """Frames of one stream with equal layout, which are collected and then processed together."""
 
     payloads: list[bytes] = field(default_factory=list)
@@ -45,7 +45,7 @@ MAX_PERIOD_OF_BURSTS = 5.0  # ms between frames: bursts of faster frames move ti
 class UnpackedBlock:
     """A block of frames as arrays: values (n, channels), and (n,) times, flags, missing frames, ticks and steps."""
 
-    def __init__(self, block: FrameBlock, tracker: "SequenceAndClock"):
+    def __init__(self, block: StreamBlock, tracker: "SequenceAndClock"):
         frames = unpack_frames(block.payloads)
         self.values, self.seq, self.bits = frames.values, frames.seq, frames.bits
         self.host, self.flags = np.array(block.host, np.int64), np.array(block.flags)
@@ -86,7 +86,7 @@ class StreamSurvey:
 
     plan: StreamPlan
     tracker: SequenceAndClock
-    block: FrameBlock = field(default_factory=FrameBlock)
+    block: StreamBlock = field(default_factory=StreamBlock)
     frames: int = 0
     lost: int = 0
     types: set[str] = field(default_factory=set)
@@ -112,7 +112,7 @@ class StreamSurvey:
 
     def flush(self) -> None:
         """Process the frames that wait in the block."""
-        block, self.block = self.block, FrameBlock()
+        block, self.block = self.block, StreamBlock()
         if not block.payloads:
             return
         batch = UnpackedBlock(block, self.tracker)

@@ -7,7 +7,7 @@ import numpy as np
 from ...calibration.logs.evaluation import LogEvaluation
 from ...fitting.fields import FittedField
 from .pads import pad_gain, symmetric_limit
-from .panels import PANEL_WIDTH, WIDE_PANEL_WIDTH, Panel, chart_axes, panel
+from .panels import PANEL_WIDTH, WIDE_PANEL_WIDTH, FigurePanel, chart_axes, panel
 from .parts import BLUE, GREY, MM, RED, bare_figure, cell_edges
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def time_figure(found: LogEvaluation) -> "Figure":
     return figure
 
 
-def place_panels(gain: FittedField, box: np.ndarray) -> list[Panel]:
+def place_panels(gain: FittedField, box: np.ndarray) -> list[FigurePanel]:
     """Gain and its standard error over the box (2, 2) m of the presses."""
     x, y, value, error = pad_gain(gain, 0, box)
     reach = symmetric_limit(value - 1)
@@ -87,7 +87,7 @@ def place_panels(gain: FittedField, box: np.ndarray) -> list[Panel]:
 
 def _place_panel(
     x: np.ndarray, y: np.ndarray, cells: np.ndarray, limits: tuple[float, float], colours: str, label: str
-) -> Panel:
+) -> FigurePanel:
     figure = bare_figure(PANEL_WIDTH, 0.8 * PANEL_WIDTH, layout="constrained")
     axes = figure.add_subplot()
     drawn = axes.pcolormesh(x, y, cells, vmin=limits[0], vmax=limits[1], cmap=colours, rasterized=True)

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ...calibration.application.force_maps import force_map
 from ...calibration.calibration import Calibration
-from ...calibration.force_maps import force_map
 from ...calibration.localisation.ellipses import INSIDE_90, confidence_ellipse
 from ..example_contacts import example_contacts, half_axes
 from ..html_parts import number_text

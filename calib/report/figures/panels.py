@@ -39,7 +39,7 @@ THEME = {
 
 
 @dataclass(frozen=True)
-class Panel:
+class FigurePanel:
     """A picture with its title; ``svg`` is an element of HTML with an alternative text of its own."""
 
     title: str
@@ -50,7 +50,7 @@ class Panel:
         return f"<figure class='panel'><figcaption>{escape(self.title)}</figcaption>{self.svg}</figure>"
 
 
-def panel(figure: "Figure", axes: Any, name: str, alt: str = "") -> Panel:
+def panel(figure: "Figure", axes: Any, name: str, alt: str = "") -> FigurePanel:
     """The panel of a figure, whose title becomes that of the panel.
 
     Args:
@@ -60,7 +60,7 @@ def panel(figure: "Figure", axes: Any, name: str, alt: str = "") -> Panel:
     lines = axes.get_title().replace(r"\$", "$").split("\n")
     title = ", ".join(lines).replace(":, ", ": ")
     axes.set_title("")
-    return Panel(title, inline_svg(figure, name, alt or title))
+    return FigurePanel(title, inline_svg(figure, name, alt or title))
 
 
 def sheet_axes(

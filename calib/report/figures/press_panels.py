@@ -12,7 +12,7 @@ from ...calibration.evaluation import Evaluation
 from ...presses.means import dominant_pad
 from .maps import ExampleMaps, draw_contact
 from .pads import curve_panel, loop_panel, pad_gain, pad_maps, residuals_by, symmetric_limit
-from .panels import WIDE_PANEL_WIDTH, Panel, chart_axes, panel, share_limits, sheet_axes
+from .panels import WIDE_PANEL_WIDTH, FigurePanel, chart_axes, panel, share_limits, sheet_axes
 from .parts import GREEN, MM, RED, colour_reach, draw_pixels, value_map
 from .presses import localisation_panel, sensitivity_maps, sensitivity_title
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 DARK = "#111111"  # marks on maps, whose colours do not follow those of the page
 
 
-def map_panels(maps: ExampleMaps) -> list[Panel]:
+def map_panels(maps: ExampleMaps) -> list[FigurePanel]:
     """Of each press its image, and its force map with the contact; common scales of colour."""
     change, density = float(np.nanmax(np.abs(maps.image))) or 1.0, float(np.nanmax(maps.density)) or 1.0
     scale, unit = (1e3, "mS") if change > 1e-4 else (1e6, "µS")
@@ -46,7 +46,7 @@ def _map_panel(
     label: str,
     *,
     contact: bool = False,
-) -> Panel:
+) -> FigurePanel:
     calibration = maps.calibration
     figure, axes, bar = sheet_axes(calibration.skin, bar=True, simulated=calibration.simulated)
     limits = axes.get_xlim(), axes.get_ylim()
@@ -60,7 +60,9 @@ def _map_panel(
     return panel(figure, axes, name)
 
 
-def localisation_panels(found: Evaluation, skin: je.Skin, *estimators: str, simulated: bool = False) -> list[Panel]:
+def localisation_panels(
+    found: Evaluation, skin: je.Skin, *estimators: str, simulated: bool = False
+) -> list[FigurePanel]:
     """True and estimated places, a panel for each estimator, with the numbers of the electrodes."""
     out = []
     for k, estimator in enumerate(estimators):
@@ -78,7 +80,7 @@ def number_electrodes(axes: Any, skin: je.Skin) -> None:
         axes.annotate(str(number), place[:2], **beside)
 
 
-def sensitivity_panels(found: Evaluation, skin: je.Skin, *, simulated: bool = False) -> list[Panel]:
+def sensitivity_panels(found: Evaluation, skin: je.Skin, *, simulated: bool = False) -> list[FigurePanel]:
     """Sensitivity over its mean at every place, a panel for each method, with one scale of colour."""
     maps, summary = sensitivity_maps(found), found.summary()
     reach = colour_reach(np.concatenate(list(maps.values())) - 1)
@@ -104,7 +106,7 @@ def _value_panel(
     title: str,
     name: str,
     simulated: bool,
-) -> Panel:
+) -> FigurePanel:
     low, high, label = scale
     figure, axes, bar = sheet_axes(skin, bar=True, simulated=simulated)
     limits = axes.get_xlim(), axes.get_ylim()
@@ -121,7 +123,7 @@ def _as_raster(drawn: Any) -> None:
     drawn.set_rasterized(True)
 
 
-def curve_panels(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> list[Panel]:
+def curve_panels(calibration: Calibration, evaluations: Mapping[str, Evaluation]) -> list[FigurePanel]:
     """Curve of each pad with its presses; errors of force by place, by force and over time."""
     owner, simulated = dominant_pad(calibration.evaluation.pressure), calibration.simulated
     pads = _charts(
@@ -146,7 +148,7 @@ def _residual_panel(
     cause: Callable[[Evaluation], np.ndarray],
     name: str,
     label: str,
-) -> Panel:
+) -> FigurePanel:
     figure, axes = chart_axes(simulated=calibration.simulated)
     shown = [calibration.evaluation, *evaluations.values()]
     residuals_by(axes, cause, calibration.evaluation, evaluations)
@@ -158,7 +160,7 @@ def _residual_panel(
     return panel(figure, axes, f"error-{name}")
 
 
-def loop_panels(calibration: Calibration) -> list[Panel]:
+def loop_panels(calibration: Calibration) -> list[FigurePanel]:
     """Force against pressure along one press of each pad."""
     found = _charts(calibration, lambda axes, number: loop_panel(axes, calibration, number))
     for _, axes in found:
@@ -178,7 +180,7 @@ def _charts(calibration: Calibration, draw: Callable[[Any, int], None]) -> list[
     return found
 
 
-def gain_panels(calibration: Calibration) -> list[Panel]:
+def gain_panels(calibration: Calibration) -> list[FigurePanel]:
     """Each pad's gain over the place pressed, and the gain's standard error with the places of the presses."""
     field, skin = calibration.field, calibration.skin
     assert field is not None

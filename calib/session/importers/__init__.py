@@ -41,8 +41,7 @@ from tqdm import tqdm
 
 from ..errors import SessionError, printable
 from .arrays import AbstractArrayImporter, ArrayShape
-from .base import About, AbstractImporter, add_common_arguments, parse_epoch
-from .columns import FileSpec, StreamSpec
+from .base import AbstractImporter, StatedFacts, add_common_arguments, parse_epoch
 from .formats import (
     CsvFile,
     CsvImporter,
@@ -54,15 +53,15 @@ from .formats import (
     import_csv,
 )
 from .reports import FileReport, ImportReport, StreamReport
-from .table_importer import AbstractTableImporter
-from .table_session import import_tables
-from .tables import AbstractTableFile, Table
+from .tables.columns import FileSpec, StreamSpec
+from .tables.importer import AbstractTableImporter
+from .tables.session import import_tables
+from .tables.table import AbstractTableFile, Table
 
 if TYPE_CHECKING:  # a second to import, and only wanted with --skin
     import jaxeit as je
 
 __all__ = [
-    "About",
     "AbstractArrayImporter",
     "AbstractImporter",
     "AbstractTableFile",
@@ -78,6 +77,7 @@ __all__ = [
     "McapImporter",
     "NpzImporter",
     "ParquetImporter",
+    "StatedFacts",
     "StreamReport",
     "StreamSpec",
     "Table",
@@ -167,7 +167,7 @@ def add_arguments(parser: argparse.ArgumentParser, own: Sequence[str] = ()) -> N
 def run(args: argparse.Namespace, skin: "je.Skin | None" = None) -> int:
     """Import as parsed by `add_arguments`, ``skin`` being the one named; prints the report. Raises `SessionError`."""
     progress = partial(tqdm, desc="lines", unit="", disable=None, leave=False)
-    about = About(args.title, args.license, parse_epoch(args.epoch), skin, progress)
+    about = StatedFacts(args.title, args.license, parse_epoch(args.epoch), skin, progress)
     summary = find_importer(args.format).convert(args, Path(args.output), about).summary()
     print("\n".join(printable(line, 1000) for line in summary.splitlines()))
     return 0

@@ -18,8 +18,8 @@ import numpy as np
 from ..errors import printable, problem
 from .child import in_child
 from .limits import MAX_COLUMNS, MAX_NAMES, check_size
-from .table_importer import AbstractTableImporter
-from .tables import AbstractTableFile, Progress, Table
+from .tables.importer import AbstractTableImporter
+from .tables.table import AbstractTableFile, Progress, Table
 
 
 class ArrayShape(NamedTuple):

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from ..errors import SessionError, printable
 from .reports import ImportReport
-from .tables import Progress
+from .tables.table import Progress
 
 if TYPE_CHECKING:  # a second to import, and only wanted with --skin
     import jaxeit as je
 
 
-class About(NamedTuple):
+class StatedFacts(NamedTuple):
     """Facts about a recording that the user states, for any format.
 
     | field    | meaning                                                                             |
@@ -46,7 +46,7 @@ class AbstractImporter(ABC):
 
     @classmethod
     @abstractmethod
-    def convert(cls, args: argparse.Namespace, output: Path, about: About) -> ImportReport:
+    def convert(cls, args: argparse.Namespace, output: Path, about: StatedFacts) -> ImportReport:
         """Write the session file that the arguments describe.
 
         Raises:

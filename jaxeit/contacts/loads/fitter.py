@@ -23,11 +23,11 @@ from jaxtyping import Array, Float
 
 from ..._compile import require_known
 from ...imaging.inputs import InverseError, require_real
-from ...imaging.whitening import Whitening
+from ...imaging.readings.whitening import Whitening
 from ..result import Contacts
 from .belief import LoadBelief
-from .fits import FrameFits
-from .programs import whiten_frame
+from .fits.kinds import FrameFits
+from .fits.programs import whiten_frame
 from .result import Loads, Proposed
 from .search import FrameSearch
 from .starts import Starts

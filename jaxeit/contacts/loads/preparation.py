@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from ..._compile import full_precision, verb
 from ...imaging.inputs import InverseError
-from ...kinds import require_kind
+from ...messages.kinds import require_kind
 from ...model.discretisation import Model
 from ...model.forward_model import coefficients, conductivity, transfer
 from ...model.gaussian_field import field_modes
@@ -20,7 +20,7 @@ from ..bump_responses import mean_conductivity, quadrature_points
 from ..preparation import MIN_SIGNAL, require_signal, sheet_and_readings
 from .belief import LoadBelief
 from .fitter import LoadFitter
-from .pressure import LOAD_PARAMETERS, MAX_LOADS, Form
+from .pressure import LOAD_PARAMETERS, MAX_LOADS, LoadForm
 from .settings import LoadSettings
 from .sheet import AbstractGain, KnownGain, PressedSheet
 from .starts import Starts
@@ -167,7 +167,7 @@ def _starts(
 
 @verb
 def _atoms(sheet: PressedSheet, rows: Float[Array, "b 4"]) -> Float[Array, "b r"]:
-    forms = jnp.array([Form.ROUND] + [Form.ABSENT] * (MAX_LOADS - 1))
+    forms = jnp.array([LoadForm.ROUND] + [LoadForm.ABSENT] * (MAX_LOADS - 1))
     respond = lambda one: sheet.response(jnp.tile(jnp.pad(one, (0, LOAD_PARAMETERS - 4)), (MAX_LOADS, 1)), forms)  # noqa: E731
     found: Array = jax.lax.map(respond, rows)
     return found

@@ -2,7 +2,7 @@
 
 Each load has six parameters: x, y, log width s, log force, and half its length along x and along y. A round load has no
 length. One table of parameters for all kinds of loads means one compiled program for all of them; which rows count,
-and how, is an array of `Form`. What kinds there are, and of which forms, is in `FORMS` alone.
+and how, is an array of `LoadForm`. What kinds there are, and of which forms, is in `FORMS` alone.
 """
 
 import math
@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .result import LoadKind
 
 
-class Form(IntEnum):
+class LoadForm(IntEnum):
     """What a row of parameters stands for."""
 
     ABSENT = 0
@@ -33,12 +33,12 @@ class Form(IntEnum):
 
 # Forms of the loads of each kind; a proposal's network tells the kinds in this order.
 FORMS = {
-    LoadKind.ONE: (Form.ROUND,),
-    LoadKind.TWO: (Form.ROUND, Form.ROUND),
-    LoadKind.EDGE: (Form.LONG,),
-    LoadKind.MORE: (Form.ROUND, Form.ROUND, Form.ROUND),
+    LoadKind.ONE: (LoadForm.ROUND,),
+    LoadKind.TWO: (LoadForm.ROUND, LoadForm.ROUND),
+    LoadKind.EDGE: (LoadForm.LONG,),
+    LoadKind.MORE: (LoadForm.ROUND, LoadForm.ROUND, LoadForm.ROUND),
 }
-MAX_LOADS, LOAD_PARAMETERS = max(map(len, FORMS.values())), max(form.parameters for form in Form)  # of each load
+MAX_LOADS, LOAD_PARAMETERS = max(map(len, FORMS.values())), max(form.parameters for form in LoadForm)  # of each load
 FORCE_INDEX = 3  # of the log of the force among these
 LINE_POINTS = (-0.8, 0.0, 0.8)  # places of the round loads that stand for an edge, over its half length
 LINE_POINT_OFFSET = np.array([0, 0, 0, np.log(len(LINE_POINTS)), 0, 0])  # of the edge's parameters over theirs
@@ -58,12 +58,12 @@ def pad_rows(rows: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "n 6"]:
 def padded_forms(kind: LoadKind) -> Int[np.ndarray, " n"]:
     """Forms of all rows of a kind of loads."""
     forms = FORMS[kind]
-    return np.array(forms + (Form.ABSENT,) * (MAX_LOADS - len(forms)), np.int32)
+    return np.array(forms + (LoadForm.ABSENT,) * (MAX_LOADS - len(forms)), np.int32)
 
 
 def free_parameters(forms: Int[np.ndarray, " n"]) -> Bool[np.ndarray, "n 6"]:
     """Which parameters of all rows are fitted."""
-    free: np.ndarray = np.arange(LOAD_PARAMETERS) < np.array([form.parameters for form in Form])[forms][:, None]
+    free: np.ndarray = np.arange(LOAD_PARAMETERS) < np.array([form.parameters for form in LoadForm])[forms][:, None]
     return free
 
 
@@ -136,7 +136,7 @@ def _sum_along_line(
         for form, load in zip(forms, loads, strict=True)
         for t in LINE_POINTS
     ]
-    found = [jnp.where(form > Form.ABSENT, change(load, points), 0) for form, load in rows]
+    found = [jnp.where(form > LoadForm.ABSENT, change(load, points), 0) for form, load in rows]
     return jnp.stack(found).reshape(len(loads), len(LINE_POINTS), *found[0].shape).sum(1)
 
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..result import Contacts
-from .comparison import evidences, summarise
-from .fits import Fit, FrameFits
+from .fits.comparison import evidences, summarise
+from .fits.kinds import Fit, FrameFits
 from .pressure import FORMS
 from .result import LoadKind, Loads, Proposed
 from .starts import Starts

@@ -8,7 +8,7 @@ import numpy as np
 from ...effects import EFFECTS, ContactPiezoresistance
 from ...imaging.absolute.background import COATING_LENGTH, COATING_STD
 from ...imaging.inputs import InverseError
-from ...kinds import require_kind
+from ...messages.kinds import require_kind
 from ...registry import limited, require_limits
 from ...registry.limits import LONGEST
 

@@ -20,9 +20,9 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from ...geometry.shapes import Domain
-from ...kinds import is_number, shown
 from ...meshing.elements import Space
 from ...meshing.footprints import AbstractFootprint
+from ...messages.kinds import is_number, shown
 from ...registry import Registry
 from ...toml import TomlTable
 

@@ -23,7 +23,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._compile import usually, verb
-from ...contacts.search import ContactFinder, Frame
+from ...contacts.search import ContactFinder, WhitenedFrame
 from ...least_squares import ImplicitStep, LeastSquaresState, LevenbergMarquardt, normal_equations
 from ...linalg import lapack
 from .response import LoadedSheet, Neighbourhood, PredictedMeasurement
@@ -210,7 +210,7 @@ class _UpdateProblem(NamedTuple):
     """
 
     contact_filter: ContactFilter
-    frame: Frame
+    frame: WhitenedFrame
     complete: Bool[Array, ""]
     pads: Pads
     belief: Belief
@@ -273,7 +273,7 @@ def active_indices(contact_filter: ContactFilter, contacts: Float[Array, "K 8"])
 
 def _whitened_frame(
     contact_filter: ContactFilter, dv: Float[Array, " readings"]
-) -> tuple[Frame, Bool[Array, ""], Float[Array, ""]]:
+) -> tuple[WhitenedFrame, Bool[Array, ""], Float[Array, ""]]:
     """A whitened frame, whether it has all readings, and the variance of a whitened reading by errors of the model."""
     dv = jnp.asarray(dv, contact_filter.compress.dtype)
     y = contact_filter.compress @ dv  # of channels that are not used the matrix is zero, but not its product with NaN
@@ -285,9 +285,9 @@ def _whitened_frame(
     return frame, complete, contact_filter.error_share * (frame.y @ frame.y) / len(frame.y)
 
 
-def _complete_frame(finder: ContactFinder, y: Float[Array, " r"], dv: Float[Array, " readings"]) -> Frame:
+def _complete_frame(finder: ContactFinder, y: Float[Array, " r"], dv: Float[Array, " readings"]) -> WhitenedFrame:
     zero = jnp.zeros((), y.dtype)
-    return Frame(y, zero, zero, finder.root)
+    return WhitenedFrame(y, zero, zero, finder.root)
 
 
 def _problem(

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from ...errors import printable, problem
-from ..base import About
-from ..columns import FileSpec
+from ..base import StatedFacts
 from ..limits import check_size
 from ..reports import ImportReport
-from ..table_importer import AbstractTableImporter
-from ..table_session import import_tables
-from ..tables import AbstractTableFile, CountedSteps, Progress, Table
+from ..tables.columns import FileSpec
+from ..tables.importer import AbstractTableImporter
+from ..tables.session import import_tables
+from ..tables.table import AbstractTableFile, CountedSteps, Progress, Table
 from .text_dates import date_columns, seconds_of
 from .text_files import count_lines, lines_of
 from .text_layout import FIRST_LINES, layout_of, wrong_sign
@@ -128,11 +128,11 @@ def import_csv(
     skin: "je.Skin | None" = None,
     progress: Progress = iter,
 ) -> ImportReport:
-    """Write the described columns of text files as one session file; see `import_tables` and `About`.
+    """Write the described columns of text files as one session file; see `import_tables` and `StatedFacts`.
 
     ``sort`` allows rows that go back in time. Raises `SessionError`, and then writes nothing.
     """
-    return import_tables(CsvFile, files, output, About(title, license, epoch, skin, progress), sort=sort)
+    return import_tables(CsvFile, files, output, StatedFacts(title, license, epoch, skin, progress), sort=sort)
 
 
 class CsvImporter(AbstractTableImporter):

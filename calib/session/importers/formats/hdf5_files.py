@@ -30,10 +30,10 @@ from ...hdf5.storage import (
 from ...reader import Session, open_session
 from ...tables import SESSION_FORMAT, STREAM_EXTRAS
 from ..arrays import AbstractArrayImporter, ArrayShape, known, table_shape
-from ..base import About
+from ..base import StatedFacts
 from ..child import in_child
 from ..reports import FileReport, ImportReport, StreamReport
-from ..tables import first_bytes
+from ..tables.table import first_bytes
 from .hdf5_arrays import MAX_DEPTH, data_inside, datasets, members, values_of
 
 MAX_BYTES = 16 << 30
@@ -70,7 +70,7 @@ class Hdf5Importer(AbstractArrayImporter):
             return [values_of(path, dataset, ArrayShape(*table_shape(dataset.shape) or (0, 1))) for dataset in picked]
 
     @classmethod
-    def convert(cls, args: argparse.Namespace, output: Path, about: About) -> ImportReport:
+    def convert(cls, args: argparse.Namespace, output: Path, about: StatedFacts) -> ImportReport:
         """See `AbstractImporter.convert`."""
         (group, *more) = args.groups
         if any((more, group.paths[1:], group.streams, group.time, group.rate)):

@@ -12,7 +12,7 @@ from ...errors import problem
 from ..arrays import AbstractArrayImporter, ArrayShape, known, table_shape, table_values
 from ..child import DAMAGED
 from ..limits import MAX_NAMES
-from ..tables import first_bytes
+from ..tables.table import first_bytes
 from .hdf5_arrays import datasets, values_of
 
 NUMERIC_CLASSES = {

@@ -15,7 +15,7 @@ from ...errors import SessionError, problem
 from ..arrays import AbstractArrayImporter, ArrayShape, table_shape, table_values
 from ..child import DAMAGED
 from ..limits import MAX_NAMES
-from ..tables import first_bytes
+from ..tables.table import first_bytes
 
 NUMBERS = "biufmM"
 HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}

@@ -10,7 +10,7 @@ from ...errors import problem
 from ..arrays import AbstractArrayImporter, ArrayShape
 from ..child import library
 from ..limits import check_size
-from ..tables import first_bytes
+from ..tables.table import first_bytes
 from .text_dates import date_columns, seconds_of
 
 EXTRA = "tables"

@@ -12,14 +12,14 @@ from typing import Any, ClassVar
 import numpy as np
 
 from jaxeit.budget import current_budget
-from jaxeit.spelling import did_you_mean
+from jaxeit.messages.spelling import did_you_mean
 
 from ...errors import printable, problem
 from ..arrays import AbstractArrayImporter, ArrayFile, ArrayShape
 from ..child import library
-from ..columns import FileSpec
 from ..limits import MAX_NAMES, check_size
-from ..tables import first_bytes
+from ..tables.columns import FileSpec
+from ..tables.table import first_bytes
 from .mcap_checksums import require_summary
 
 EXTRA = "tables"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ...errors import problem
 from ..limits import MAX_LINE, require_within
-from ..tables import first_bytes
+from ..tables.table import first_bytes
 
 PIECE = 1 << 20
 _SEPARATOR_LINE = re.compile(r'"?sep=.?"?\s*')

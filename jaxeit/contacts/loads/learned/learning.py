@@ -34,12 +34,12 @@ from scipy.linalg import solve_triangular
 
 from ...._compile import require_known
 from ....imaging.inputs import InverseError, require_real
-from ....kinds import require_unmasked
+from ....messages.kinds import require_unmasked
 from ....model.discretisation import Model
 from ..belief import LoadBelief
-from ..comparison import log_evidence
-from ..considered import inverse_of, law_sensitivities, mean_errors
-from ..fits import FINAL_FALL_ATOL, Fit, FrameFits
+from ..fits.comparison import log_evidence
+from ..fits.kinds import FINAL_FALL_ATOL, Fit, FrameFits
+from ..fits.shape_errors import inverse_of, law_sensitivities, mean_errors
 from ..preparation import prepare_loads, texture_modes
 from ..pressure import FORCE_INDEX
 from ..result import LoadKind

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from ....array_files import read_arrays, write_arrays
 from ....imaging.inputs import InverseError, require_real
-from ....kinds import require_unmasked
+from ....messages.kinds import require_unmasked
 from ....skin import Skin, skin_hash
 from ..pressure import FORMS
 from ..result import LoadKind, Proposed

@@ -1,0 +1,1 @@
+"""Frames for training: random scenes, and folders of their frames."""

@@ -1,0 +1,1 @@
+"""Recipes of calibrations, as objects and as TOML."""

@@ -1,0 +1,1 @@
+"""Commands that make a calibration, or put one to use."""

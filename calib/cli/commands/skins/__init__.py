@@ -1,0 +1,1 @@
+"""Commands about a skin and this machine: costs, designs, training."""

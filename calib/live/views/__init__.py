@@ -1,0 +1,1 @@
+"""Views of live results: the page, lines of JSON, and rerun."""

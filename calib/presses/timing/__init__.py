@@ -1,0 +1,1 @@
+"""When presses are: detection, times, windows, and delays of the streams."""

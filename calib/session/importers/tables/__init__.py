@@ -1,0 +1,1 @@
+"""Tables of numbers in files: columns, clocks, and the conversion to a session."""

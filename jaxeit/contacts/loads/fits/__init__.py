@@ -1,0 +1,1 @@
+"""Fits of kinds of loads to one frame, and how they compare."""

@@ -1,0 +1,1 @@
+"""Sparse Cholesky by nested dissection: ordering, symbolic and numerical factorisation, and solves."""
