@@ -36,8 +36,8 @@ slow: $(VENV)/.dev
 	$(AS_USERS) $(BIN)/python -m pytest -o faulthandler_timeout=1800 -m slow
 
 # The tests that run what the pages, the docstrings and the examples show; tests/test_page_blocks.py holds the list.
-SHOWN := test_docs test_eidors_pages test_examples test_notebook test_page_blocks test_page_commands test_program_cache \
-    test_programs test_readme test_release test_site test_tutorials batch/test_random_frames export/test_c_header \
+SHOWN := test_batches test_docs test_eidors_pages test_examples test_notebook test_page_blocks test_page_commands \
+    test_program_cache test_programs test_readme test_release test_site test_tutorials batch/test_random_frames export/test_c_header \
     export/test_lerobot_page record/test_wire registry/test_own_classes simulators/test_mujoco tanks/test_tanks
 
 pages: $(VENV)/.dev

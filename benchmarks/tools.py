@@ -307,6 +307,12 @@ def batched(problem: Problem, batch: int, dtype: str = "float64") -> Tool:
     return lambda sigma: tool(shapes * sigma)
 
 
+def shared_out(problem: Problem, dtype: str = "float64") -> Tool:
+    """Voltages with each of the contacts, (CONTACTS, readings), a share on each device of JAX."""
+    many, shapes = je.bind_many(je.forward, problem.model(dtype)), contacts(problem)
+    return lambda sigma: np.asarray(many((shapes * sigma).astype(dtype)))
+
+
 def share(prepare: Callable[[Problem], Tool], problem: Problem, number: int, count: int) -> Tool:
     """The tool for one of ``count`` equal shares of the contacts."""
     tool, shapes = prepare(problem), np.array_split(contacts(problem), count)[number]
@@ -322,6 +328,8 @@ def in_processes(prepare: Callable[[Problem], Tool]) -> Callable[[Problem], Tool
     return lambda problem: InProcesses(partial(share, prepare, Problem(problem.cells)))  # without what is cached
 
 
+ALL_CORES = f"batches of {CONTACTS}, all cores"
+
 BATCH = (
     *(Entry(f"jaxeit float64, batches of {n}", partial(batched, batch=n)) for n in (1, 8, CONTACTS)),
     *(
@@ -330,6 +338,8 @@ BATCH = (
         )
         for n in (8, CONTACTS)
     ),
+    Entry(f"jaxeit float64, {ALL_CORES}", shared_out),
+    Entry(f"jaxeit float32, {ALL_CORES}", partial(shared_out, dtype="float32"), loose=MAX_FLOAT32_DIFFERENCE),
     Entry(superlu.NAME, one_by_one(superlu.prepare), superlu),
     Entry(cholmod.NAME, one_by_one(cholmod.prepare), cholmod),
     Entry(f"{cholmod.NAME}, forward substitution only, all cores", in_processes(cholmod.prepare_substituted), cholmod),

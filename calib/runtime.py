@@ -27,6 +27,17 @@ def set_up() -> None:
         keep_programs(folder)
 
 
+def set_up_batches() -> None:
+    """As `set_up`, with a device of JAX for each core, so that batches of solutions occupy them all.
+
+    To be called before anything is computed; later, or where the environment states a number, nothing changes.
+    """
+    set_up()
+    if "host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        with suppress(RuntimeError):
+            jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+
+
 def set_up_live() -> None:
     """As `set_up`, and each program runs in the thread that calls it.
 

@@ -27,6 +27,7 @@ from ._compile import (
     verb as verb,
 )
 from .accuracy import ladder as ladder
+from .batches import bind_many as bind_many
 from .budget import Budget as Budget, BudgetError as BudgetError
 from .contacts import (
     ContactFinder as ContactFinder,

@@ -57,7 +57,7 @@ def verb(function: F) -> F:
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        if _is_transformed(args, kwargs):
+        if is_transformed(args, kwargs):
             return inner(*args, **kwargs)
         with _plain_precision():
             found = outer(changes_of_folder())(*args, **kwargs)
@@ -114,9 +114,9 @@ def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | N
     inner = _bound(*key, (), None)  # JAX takes options for whole programs only
     if programs_folder() is None:
         outer = _bound(*key, flags, None)
-        return lambda *rest: (inner if _is_transformed(rest) else outer)(packs, rest)
+        return lambda *rest: (inner if is_transformed(rest) else outer)(packs, rest)
     kept = _bound(*key, flags, changes_of_folder())
-    return lambda *rest: inner(packs, rest) if _is_transformed(rest) else unbound(kept(packs, rest))
+    return lambda *rest: inner(packs, rest) if is_transformed(rest) else unbound(kept(packs, rest))
 
 
 @lru_cache(maxsize=256)
@@ -205,7 +205,7 @@ def require_known(name: str, error: type[Exception], *values: Any) -> None:
         )
 
 
-def _is_transformed(*values: Any) -> bool:
+def is_transformed(*values: Any) -> bool:
     """Whether a transformation of JAX is active: on these values, or on everything that is computed now."""
     return is_traced(*values) or get_opaque_trace_state() != _untransformed_state()
 

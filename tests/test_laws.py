@@ -21,7 +21,7 @@ import jaxeit as je
 
 ROOT = Path(__file__).parents[1]
 ORDER = [
-    "messages", "budget", "files", "array_files", "notebook", "program_cache", "_compile", "toml",
+    "messages", "budget", "files", "array_files", "notebook", "program_cache", "_compile", "batches", "toml",
     "registry", "geometry", "meshing", "linalg", "skin", "effects", "least_squares", "model",
     "imaging", "metrics", "fusion", "contacts", "tracking", "scan", "accuracy", "plot", "__main__",
 ]  # fmt: skip

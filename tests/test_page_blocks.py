@@ -38,6 +38,7 @@ RUN = {
     "docs/proposal.md": {"python": "test_docs.py", "": "test_page_commands.py"},
     "docs/ros.md": {"": "test_page_commands.py"},
     "docs/scenes.md": {"toml": "test_docs.py"},
+    "docs/speed.md": {"python": "test_batches.py"},
     "docs/tanks.md": {
         "python": "tanks/test_tanks.py",
         "matlab": "test_eidors_pages.py",

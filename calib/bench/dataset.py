@@ -1,13 +1,10 @@
 """The paper's data set: voltages of Gaussian contacts on a grid of places, at a range of amplitudes."""
 
-from collections.abc import Callable
-from functools import cache, partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec as P
 from jaxtyping import Array, Float
 
 import jaxeit as je
@@ -17,7 +14,7 @@ from .bench import BenchError
 from .simulation import Progress
 
 FORMAT = "skin-dataset"
-CONTACTS_PER_DEVICE = 64  # contacts that are sent to a device at a time
+CONTACTS_PER_DEVICE = 64  # contacts that are sent to a device in one piece of progress
 # Contacts that are solved together. From `jaxeit.linalg.multifrontal.batches.MIN_BATCH` on, a solve takes a quarter
 # to a half of the time, but the program takes twice as long to compile, which pays only for many contacts.
 FEW_TOGETHER, MANY_TOGETHER, MANY = 8, 32, 1000
@@ -41,7 +38,7 @@ def simulate_contacts(
 ) -> Float[np.ndarray, "places amplitudes readings"]:
     """Voltages (V) for ``sigma = sigma0 (1 + amplitude exp(-|r - place|^2 / (2 width^2)))``, sigma0 that of the scene.
 
-    The contacts are solved in batches, which are distributed over all devices of JAX.
+    The contacts are solved in batches, which are shared out over all devices of JAX (`jaxeit.bind_many`).
 
     Args:
         places: centres of the contacts, m.
@@ -56,40 +53,23 @@ def simulate_contacts(
         frames = calib.bench.simulate_contacts(model, places, np.array([0.0, 0.5]), width=0.012)  # V
         print(frames.shape, "places, amplitudes, readings")
     """
-    devices = Mesh(np.array(jax.devices()), ("contacts",))
-    piece = CONTACTS_PER_DEVICE * devices.size
     at, size = np.repeat(np.arange(len(places)), len(amplitudes)), np.tile(amplitudes, len(places))
+    contacts = np.column_stack([places[at], size]).astype(model.dtype)
+    together, spread = MANY_TOGETHER if len(at) >= MANY else FEW_TOGETHER, jnp.asarray(width, model.dtype)
+    solve = je.bind_many(_frame, model, je.conductivity(model), spread, together=together)
+    piece = min(CONTACTS_PER_DEVICE * jax.local_device_count(), len(at))
     out = np.empty((len(at), model.readings), model.dtype)
-    split, whole = NamedSharding(devices, P("contacts")), NamedSharding(devices, P())
-    model, spread = jax.device_put((model, jnp.asarray(width, model.dtype)), whole)
-    sigma, solver = je.conductivity(model), _sharded_solver(devices, MANY_TOGETHER if len(at) >= MANY else FEW_TOGETHER)
     for start in progress(range(0, len(at), piece)):
         rows = np.minimum(np.arange(start, start + piece), len(at) - 1)
-        batch = np.column_stack([places[at[rows]], size[rows]]).astype(model.dtype)
-        voltages = solver(model, sigma, spread, jax.device_put(batch, split))
-        out[start : start + piece] = np.asarray(voltages)[: len(at) - start]
+        out[start : start + piece] = np.asarray(solve(contacts[rows]))[: len(at) - start]
     return out.reshape(len(places), len(amplitudes), -1)
 
 
-@cache
-def _sharded_solver(devices: Mesh, together: int) -> Callable[..., Array]:
-    # Without the check of replication, because loops in the solver start from constants, which the check takes for
-    # equal on all devices.
-    specs = (P(), P(), P(), P("contacts"))
-    solve = partial(_solve_contacts, together=together)
-    solved = jax.shard_map(solve, mesh=devices, in_specs=specs, out_specs=P("contacts"), check_vma=False)
-    return jax.jit(solved, compiler_options=je.compiler_options())
-
-
-def _solve_contacts(
-    model: je.Model, sigma: Array, width: Array, batch: Float[Array, "n 3"], *, together: int
-) -> Float[Array, "n readings"]:
-    def frame(contact: Array) -> Array:
-        square = jnp.sum((model.centroids - contact[:2]) ** 2, -1)
-        return je.forward(model, sigma * (1 + contact[2] * jnp.exp(-0.5 * square / width**2)))
-
-    found: Float[Array, "n readings"] = jax.lax.map(frame, batch, batch_size=together)
-    return found
+def _frame(
+    model: je.Model, sigma: Array, width: Float[Array, ""], contact: Float[Array, "3"]
+) -> Float[Array, " readings"]:
+    square = jnp.sum((model.centroids - contact[:2]) ** 2, -1)
+    return je.forward(model, sigma * (1 + contact[2] * jnp.exp(-0.5 * square / width**2)))
 
 
 def write_data_set(

@@ -33,6 +33,7 @@ HOST = {
     "adjacent": _DESCRIBES,
     "all_pairs": _DESCRIBES,
     "bind": "what it is given has",
+    "bind_many": "what it is given has",
     "compile_tracker": _PREPARES,
     "compiler_options": _DESCRIBES,
     "design_scan": _PREPARES,

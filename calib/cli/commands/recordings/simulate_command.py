@@ -74,9 +74,9 @@ def run(args: argparse.Namespace) -> int:
     if bool(args.output) == args.explain:
         raise ValueError("give either -o SESSION.h5 to simulate, also with --serve, or --explain")
     _refuse_lone_options(args)
-    from ....runtime import set_up
+    from ....runtime import set_up, set_up_batches
 
-    set_up()
+    (set_up_batches if args.data_set else set_up)()
     from ....bench import SIMULATION, load_bench, measure_costs, render_costs, simulate
 
     if args.data_set:
