@@ -112,6 +112,18 @@ def _speed(forward: Row, jacobian: Row) -> Iterator[Row]:
         )
 
 
+LEVELS_OF = 3721  # nodes of the mesh whose levels stand on the page
+
+
+def _levels(forward: Row) -> list[Row]:
+    """Steps of the solve on one mesh, with the share of each and what it reaches of the machine's limit; then all."""
+    rows = [row for row in forward["levels"] if row["nodes"] == LEVELS_OF]
+    whole, least = rows[-1]["until_ms"], [row.get("least_ms", 0.0) for row in rows]
+    every = [row | {"share": row["ms"] / whole} for row in rows]
+    known = [row | {"reached": row["least_ms"] / row["ms"]} if "least_ms" in row else row for row in every]
+    return [*known, {"step": "all", "ms": whole, "share": 1.0, "reached": sum(least) / whole}]
+
+
 def _batches(results: Row) -> list[Row]:
     """Solutions a second of each tool."""
     return [row | {"per_s": 1e3 * CONTACTS / row["median_ms"]} for row in results["rows"]]
@@ -366,6 +378,7 @@ ROWS: dict[str, Callable] = {
     "evaluation": _evaluation,
     "speed": _speed,
     "batches": _batches,
+    "levels": _levels,
     "onto": _onto,
     "two_fingers": _two_fingers,
     "gpu_batches": _gpu_batches,

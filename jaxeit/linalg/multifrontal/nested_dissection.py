@@ -120,14 +120,14 @@ def _root_corner_lanes(
 
     def several(values: Float[Array, "lanes nnz"]) -> Float[Array, "lanes r r"]:
         scale, scaled = jax.vmap(partial(jacobi_scale, plan))(values)
-        padded = jax.vmap(_padded)(scaled)
+        padded = jax.vmap(with_constants)(scaled)
         update = eliminated_lanes(narrow, lax.optimization_barrier(padded.T))
         found: Float[Array, "lanes r r"] = jax.vmap(beyond)(padded, update, scale)
         return found
 
     def beyond(padded: Array, update: Float[Array, "m b b"], scale: Float[Array, " n"]) -> Float[Array, "r r"]:
-        update, _ = _swept(plan.levels[1:top], padded, update, keep=False)
-        _, (root,) = _swept(plan.levels[:1], padded, update, keep=True)
+        update, _ = swept(plan.levels[1:top], padded, update, keep=False)
+        _, (root,) = swept(plan.levels[:1], padded, update, keep=True)
         return _corner_of(plan, root, scale)
 
     return several
@@ -146,43 +146,43 @@ def _corner_of(plan: NestedDissectionPlan, root: Front, scale: Float[Array, " n"
     return y.T @ y
 
 
-def _padded(values: Float[Array, " nnz"]) -> Float[Array, " nnz_and_2"]:
+def with_constants(values: Float[Array, " nnz"]) -> Float[Array, " nnz_and_2"]:
     """The values, then what `symbolic.Level` has where there is none: a zero, and a one for padded pivots."""
     return jnp.concatenate([values, jnp.array([0.0, 1.0], values.dtype)])
 
 
 def _eliminated(plan: NestedDissectionPlan, values: Float[Array, " nnz"], keep: bool) -> tuple[Front, ...]:
     """The factors of all fronts, from the root down; of the root only, unless ``keep``."""
-    padded = _padded(values)
+    padded = with_constants(values)
     top = max(plan.subtrees, 1)
     update, low = by_platform(
         plan.levels[top:],
         padded,
-        cpu=partial(_in_subtrees, count=1 if keep else 1 << plan.subtrees, keep=keep),
-        default=partial(_in_subtrees, count=1, keep=keep),
+        cpu=partial(in_subtrees, count=1 if keep else 1 << plan.subtrees, keep=keep),
+        default=partial(in_subtrees, count=1, keep=keep),
     )
-    update, middle = _swept(plan.levels[1:top], padded, update, keep)
-    _, root = _swept(plan.levels[:1], padded, update, True)
+    update, middle = swept(plan.levels[1:top], padded, update, keep)
+    _, root = swept(plan.levels[:1], padded, update, True)
     found: tuple[Front, ...] = root + middle + low
     return found
 
 
-def _in_subtrees(
+def in_subtrees(
     levels: tuple[LevelPlan, ...], values: Array, count: int, keep: bool
 ) -> tuple[Float[Array, "m b b"], tuple[Front, ...]]:
-    """`_swept` over one subtree after another, so that their fronts stay in the processor's cache."""
+    """`swept` over one subtree after another, so that their fronts stay in the processor's cache."""
     leafless = jnp.zeros((0, 1, 1), values.dtype)
     if count == 1:
-        return _swept(levels, values, leafless, keep)
+        return swept(levels, values, leafless, keep)
     apart = jax.tree.map(lambda a: a.reshape(count, a.shape[0] // count, *a.shape[1:]), levels)
-    found = lax.map(lambda levels: _swept(levels, values, leafless, keep), apart)
+    found = lax.map(lambda levels: swept(levels, values, leafless, keep), apart)
     out: tuple[Float[Array, "m b b"], tuple[Front, ...]] = jax.tree.map(
         lambda a: a.reshape(a.shape[0] * a.shape[1], *a.shape[2:]), found
     )
     return out
 
 
-def _swept(
+def swept(
     levels: tuple[LevelPlan, ...], values: Array, update: Float[Array, "children q q"], keep: bool
 ) -> tuple[Float[Array, "m b b"], tuple[Front, ...]]:
     """Eliminate these levels, the last one first: the update of the level above, and the factors if ``keep``."""
