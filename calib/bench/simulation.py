@@ -17,7 +17,7 @@ from jaxeit.messages.kinds import require_kind
 
 from ..session import PressTable, SessionFacts, SessionWriter, Status, StreamFacts
 from ..session.given import call_on
-from ..session.hdf5.storage import disk_full_named
+from ..session.outputs import disk_full_named
 from .bench import Bench, BenchError
 from .motion import BenchMotion
 from .streams import AbstractSimulatedStream, SampleBlock, SimulatedStreams, simulated_streams

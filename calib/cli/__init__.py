@@ -94,7 +94,7 @@ def _with_remedy(error: Exception) -> str:
     """The message of an error; of a disk that is full also what to do, where the error does not name it."""
     if not isinstance(error, OSError) or error.filename is not None:
         return one_line(error)
-    from ..session.hdf5.storage import FREE_SPACE, disk_full
+    from ..session.outputs import FREE_SPACE, disk_full
 
     why = disk_full(error)
     return f"the output cannot be written ({why}); {FREE_SPACE}" if why else one_line(error)

@@ -16,7 +16,7 @@ from ..calibration.logs.procedure import FORCE_FORMAT as LOG_FORCES
 from ..session import ArchiveReader, open_archive
 from ..session.archive import archive_format
 from ..session.errors import printable, problem
-from ..session.hdf5.storage import folder_beside, require_no_input, require_no_session
+from ..session.outputs import folder_beside, require_no_input, require_no_session
 
 BLOCK = 4096  # rows that are read at once
 CONTACTS = "-contacts.csv"  # end of the name of the second table

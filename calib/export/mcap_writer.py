@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from ..session.errors import printable, problem
-from ..session.hdf5.storage import folder_beside, sync
 from ..session.importers.child import library
 from ..session.importers.formats.mcap_checksums import write_summary_checksum
+from ..session.outputs import folder_beside, sync
 from .message_sink import AbstractMessageSink
 
 EXTRA = "tables"

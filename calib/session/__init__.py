@@ -29,7 +29,7 @@ Example:
 from .archive import Archive, ArchiveReader, ArchiveWriter, open_archive, read_archive, write_archive
 from .errors import SessionError
 from .facts import SessionFacts, StreamFacts
-from .hdf5.storage import file_hash, replacing, require_no_session
+from .outputs import file_hash, replacing, require_no_session
 from .reader import Session, open_session
 from .stream import Stream
 from .tables import ClockTable, Events, PressTable, Status

@@ -21,11 +21,9 @@ from jaxeit.budget import OR_RAISE, current_budget
 
 from .errors import printable, problem
 from .hdf5.chunks import MAX_RANK, GuardedArray
-from .hdf5.guard import Node, open_guarded, root_node, translated
-from .hdf5.storage import (
+from .hdf5.datasets import (
     DIMENSION_NAME,
     AttributeValue,
-    FileWriter,
     GrowingArray,
     attach,
     make_array,
@@ -34,6 +32,8 @@ from .hdf5.storage import (
     put_attributes,
     text_array,
 )
+from .hdf5.guard import Node, open_guarded, root_node, translated
+from .hdf5.new_files import FileWriter
 from .reader import check_version
 from .tables import SESSION_FORMAT
 

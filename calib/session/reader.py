@@ -15,8 +15,8 @@ from .errors import SessionError, printable, problem
 from .hdf5.chunks import GuardedArray
 from .hdf5.guard import Node, open_guarded, root_node
 from .hdf5.members import SCHEMA, column, declared_unit, required, small_array
-from .hdf5.storage import file_hash
 from .mixing import TERMS, count_readings, mixing_of_terms
+from .outputs import file_hash
 from .stream import Stream
 from .tables import CLOCK_ATTRIBUTES, PRESS_COLUMNS, SESSION_FORMAT, ClockTable, Events, PressTable
 from .units import Unit

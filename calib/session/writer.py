@@ -17,19 +17,19 @@ from numpy.typing import ArrayLike
 
 from calib.session.errors import SessionError, printable, problem
 from calib.session.facts import SessionFacts, StreamFacts
-from calib.session.hdf5.storage import (
+from calib.session.hdf5.datasets import (
     AttributeValue,
-    FileWriter,
     GrowingArray,
     attach,
     make_array,
     make_group,
     make_index,
     put_attributes,
-    require_no_session,
     text_array,
 )
+from calib.session.hdf5.new_files import FileWriter
 from calib.session.mixing import checked_mixing, count_readings, terms_of_mixing
+from calib.session.outputs import require_no_session
 from calib.session.tables import (
     CLOCK_ATTRIBUTES,
     MIXED_VERSION,

@@ -13,7 +13,7 @@ import pytest
 
 from calib.cli import main
 from calib.live.views import presentation
-from calib.session.hdf5 import storage
+from calib.session import outputs
 from tests.record.test_full_disk import SCENE
 from tests.record.test_recorder import both, journal
 
@@ -94,7 +94,7 @@ def test_a_command_that_is_cut_short_leaves_what_was_there(name, fault, commands
     else:
         (tmp_path / output).write_bytes(EARLIER)
         before = {output}
-    monkeypatch.setattr(storage, "sync", spoilt(cause, tmp_path))
+    monkeypatch.setattr(outputs, "sync", spoilt(cause, tmp_path))
     assert main(arguments) == status
     told = capsys.readouterr().err.strip().splitlines()[-1]
     assert told.startswith("jaxeit: ")
@@ -111,13 +111,13 @@ def test_a_command_that_is_cut_short_leaves_what_was_there(name, fault, commands
 def test_a_command_under_nohup_outlives_its_terminal(commands, tmp_path, monkeypatch):
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     arguments, option, output = commands["import"]
-    monkeypatch.setattr(storage, "sync", spoilt(FAULTS["SIGHUP"][0], tmp_path))
+    monkeypatch.setattr(outputs, "sync", spoilt(FAULTS["SIGHUP"][0], tmp_path))
     assert main([*map(str, arguments), option, str(tmp_path / output)]) == 0
     assert (tmp_path / output).is_file()
 
 
 def spoilt(cause, folder):
-    """`storage.sync` that meets the fault at the first file in ``folder``."""
+    """`outputs.sync` that meets the fault at the first file in ``folder``."""
 
     def sync(path):
         if path.is_relative_to(folder):

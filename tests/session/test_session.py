@@ -40,7 +40,7 @@ from calib.session import (
     write_archive,
 )
 from calib.session.hdf5.chunks import checksum_holds
-from calib.session.hdf5.storage import folder_beside
+from calib.session.outputs import folder_beside
 
 EPOCH = datetime(2025, 1, 1, 12, tzinfo=UTC)
 PATTERN = np.array([[0, 1, 2, 3], [1, 2, 3, 4], [2, 3, 4, 0]])

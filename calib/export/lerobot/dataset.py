@@ -15,7 +15,7 @@ from ...calibration.application.map_files import FORCE_MAP_FORMAT
 from ...session import ArchiveReader, open_archive
 from ...session.errors import problem
 from ...session.given import paths_of
-from ...session.hdf5.storage import folder_beside
+from ...session.outputs import folder_beside
 from ..errors import ExportError
 from .files import DEFAULT_FEATURES, FrameFiles, info_of, write_metadata
 from .stats import FeatureStats, Stats, aggregated, flat

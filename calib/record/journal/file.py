@@ -20,7 +20,7 @@ from typing import BinaryIO, NamedTuple
 
 from jaxeit.files import open_regular
 
-from ...session.hdf5.storage import sync
+from ...session.outputs import sync
 
 try:
     import fcntl

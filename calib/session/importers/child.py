@@ -20,7 +20,7 @@ import numpy as np
 from jaxeit.budget import current_budget
 
 from ..errors import SessionError, printable, problem
-from ..hdf5.storage import writing
+from ..outputs import writing
 
 try:
     import resource

@@ -16,17 +16,9 @@ import h5py
 import numpy as np
 
 from ...errors import printable, problem
-from ...hdf5.storage import (
-    AttributeValue,
-    make_array,
-    make_dataset,
-    make_group,
-    new_file,
-    put_attributes,
-    replacing,
-    text_array,
-    writing,
-)
+from ...hdf5.datasets import AttributeValue, make_array, make_dataset, make_group, put_attributes, text_array
+from ...hdf5.new_files import new_file
+from ...outputs import replacing, writing
 from ...reader import Session, open_session
 from ...tables import SESSION_FORMAT, STREAM_EXTRAS
 from ..arrays import AbstractArrayImporter, ArrayShape, known, table_shape

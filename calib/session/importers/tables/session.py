@@ -16,7 +16,7 @@ import numpy as np
 
 from ...errors import SessionError, printable, problem
 from ...facts import SessionFacts, StreamFacts
-from ...hdf5.storage import IMPORT, file_hash, require_no_input, require_no_session
+from ...outputs import IMPORT, file_hash, require_no_input, require_no_session
 from ...tables import Status
 from ...units import KNOWN_UNITS, UNITS, VARIABLE_UNIT, wrong_quantity
 from ...writer import SessionWriter, program
