@@ -1,25 +1,20 @@
 """Write a session file, streams row by row; the file appears whole or not at all."""
 
 import os
-import re
 import uuid
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
-from calib.session.errors import SessionError, printable, problem
-from calib.session.facts import SessionFacts, StreamFacts
-from calib.session.hdf5.datasets import (
+from .errors import SessionError, printable, problem
+from .facts import SessionFacts, StreamFacts
+from .hdf5.datasets import (
     AttributeValue,
-    GrowingArray,
     attach,
     make_array,
     make_group,
@@ -27,27 +22,21 @@ from calib.session.hdf5.datasets import (
     put_attributes,
     text_array,
 )
-from calib.session.hdf5.new_files import FileWriter
-from calib.session.mixing import checked_mixing, count_readings, terms_of_mixing
-from calib.session.outputs import require_no_session
-from calib.session.tables import (
+from .hdf5.new_files import FileWriter
+from .hdf5.protocols import checked_protocol, write_protocol
+from .hdf5.stream_writer import NAME, StreamWriter
+from .outputs import require_no_session
+from .tables import (
     CLOCK_ATTRIBUTES,
     MIXED_VERSION,
     PRESS_COLUMNS,
     SESSION_FORMAT,
     SESSION_VERSION,
-    STREAM_EXTRAS,
     ClockTable,
     Column,
     Events,
     PressTable,
-    Status,
 )
-from calib.session.units import UNITS, VARIABLE_UNIT
-
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
-RESERVED = {"time", "status", "channel", *STREAM_EXTRAS}
-STREAM_TYPES = {"f4", "f8", "i2", "i4"}
 
 
 def program() -> str:
@@ -56,21 +45,6 @@ def program() -> str:
         return f"jaxeit {metadata.version('jaxeit')}"
     except metadata.PackageNotFoundError:
         return "jaxeit"
-
-
-@dataclass
-class _Stream:
-    """One stream while it is written."""
-
-    group: h5py.Group
-    variable: str
-    channels: int
-    dtype: np.dtype
-    scale: float
-    offset: float
-    attrs: dict[str, AttributeValue]
-    columns: dict[str, GrowingArray]
-    last: int | None = None
 
 
 class SessionWriter(FileWriter):
@@ -94,8 +68,8 @@ class SessionWriter(FileWriter):
         if facts.simulated and (facts.scene is None or facts.seed is None):
             raise self._problem("scene", "a simulated session does not say how", "give scene, seed")
         self._facts = facts
-        self._protocol = _protocol(self.path, facts)
-        self._streams: dict[str, _Stream] = {}
+        self._protocol = checked_protocol(self.path, facts)
+        self._streams: dict[str, StreamWriter] = {}
         self._presses: PressTable | None = None
         self._truth: dict[str, tuple[np.ndarray, str]] = {}
         self._events: list[Events] = []
@@ -134,7 +108,7 @@ class SessionWriter(FileWriter):
         if not self._streams:
             raise self._problem("/streams", "the session has no stream", "add at least one")
         for stream in self._streams.values():
-            self._finish_stream(stream)
+            stream.finish(self._time_attrs("time of the sample"))
         self._write_presses(file)
         self._write_events(file)
         self._write_truth(file)
@@ -146,23 +120,8 @@ class SessionWriter(FileWriter):
     def _write_device(self, file: h5py.File) -> None:
         about = {"NX_class": "NXinstrument", "skin": self._facts.skin_name, "skin_toml": self._facts.skin_toml}
         device = make_group(file, "device", about)
-        if not self._protocol:
-            return
-        numbers = {k: v for k, v in self._protocol.items() if isinstance(v, float)}
-        group = make_group(device, "eit_protocol", {"NX_class": "NXcollection", **numbers})
-        pattern = self._protocol["pattern"]
-        mixing = self._protocol.get("mixing")
-        rows = make_index(group, "measurement" if mixing is None else "row", len(pattern))
-        readings = rows if mixing is None else make_index(group, "measurement", mixing.shape[0])
-        terminals = make_index(group, "terminal", 4)
-        meaning = "electrodes (zero-based): drive+, drive-, sense+, sense-"
-        attrs = {"units": "1", "long_name": meaning}
-        attach(make_array(group, "pattern" if mixing is None else "row_pattern", pattern, attrs), rows, terminals)
-        if "offset" in self._protocol:
-            attrs = {"units": "s", "long_name": "when in the scan each reading is taken"}
-            attach(make_array(group, "offset", self._protocol["offset"], attrs), readings)
-        if mixing is not None:
-            _write_mixing(group, mixing)
+        if self._protocol:
+            write_protocol(device, self._protocol)
 
     def _time_attrs(self, meaning: str) -> dict[str, str]:
         units = f"nanoseconds since {self._epoch}"
@@ -176,46 +135,9 @@ class SessionWriter(FileWriter):
         Values are in SI units. Integer types are packed as ``stored = (value - add_offset) / scale_factor`` (CF), their
         lowest number meaning missing.
         """
-        where, dtype = f"/streams/{name}", np.dtype(facts.dtype)
-        variable, channels = facts.variable, facts.channels
-        for text in (name, variable):
-            if not NAME.fullmatch(text) or text in RESERVED or name in self._streams:
-                raise self._problem(where, f"name {text!r} cannot be used", "use a new plain name")
-        self._check_units(where, variable, facts.units)
-        kind = f"{dtype.kind}{dtype.itemsize}"
-        if kind not in STREAM_TYPES or channels < 1 or not np.isfinite(facts.rate_hz) or facts.rate_hz <= 0:
-            what = f"{channels} channels of {kind} at {facts.rate_hz} Hz cannot be stored"
-            raise self._problem(where, what, f"use {sorted(STREAM_TYPES)}, >= 1 channel, a rate > 0")
-        scale, offset = self._packing(where, dtype, facts)
-        attrs: dict[str, AttributeValue] = {"NX_class": "NXdata", "signal": variable}
-        attrs["axes"] = ["time", "channel"]
-        attrs |= {"nominal_rate_hz": float(facts.rate_hz), "clock": facts.clock, "transport": facts.transport}
-        group = make_group(self._open()["streams"], name, attrs)
-        columns = {
-            "time": GrowingArray(group, "time", (), np.dtype("i8")),
-            variable: GrowingArray(group, variable, (channels,), dtype),
-            "status": GrowingArray(group, "status", (), np.dtype("u2")),
-        }
-        about: dict[str, AttributeValue] = {"units": facts.units}
-        about["long_name"] = facts.long_name or f"{name} {variable}"
-        self._streams[name] = _Stream(group, variable, channels, dtype, scale, offset, about, columns)
-
-    def _check_units(self, where: str, variable: str, units: str) -> None:
-        expected = VARIABLE_UNIT.get(variable, units)
-        if units not in UNITS or UNITS[units].si != units or units != expected:
-            wanted = VARIABLE_UNIT.get(variable) or (UNITS[units].si if units in UNITS else "an SI unit")
-            raise self._problem(where, f"{variable} is given in {units!r}", f"convert it to {wanted} before writing")
-
-    def _packing(self, where: str, dtype: np.dtype, facts: StreamFacts) -> tuple[float, float]:
-        units, scale, offset = facts.units, facts.scale_factor, facts.add_offset
-        if dtype.kind == "f" and (scale is not None or offset is not None):
-            raise self._problem(where, "floats are not packed", "leave scale_factor, add_offset out")
-        if dtype.kind == "i" and scale is None and units != "1":
-            raise self._problem(where, f"whole {units} are too coarse", "give scale_factor")
-        scale, offset = 1.0 if scale is None else float(scale), float(offset or 0.0)
-        if not np.isfinite([scale, offset]).all() or scale == 0:
-            raise self._problem(where, "scale_factor or add_offset is unusable", "give numbers")
-        return scale, offset
+        if name in self._streams:
+            raise self._problem(f"/streams/{name}", f"name {name!r} cannot be used", "use a new plain name")
+        self._streams[name] = StreamWriter(self.path, self._open()["streams"], name, facts)
 
     def append(
         self,
@@ -237,95 +159,9 @@ class SessionWriter(FileWriter):
         if name not in self._streams:
             known = ", ".join(self._streams) or "none yet"
             raise self._problem(f"/streams/{name}", "unknown stream", f"add_stream first ({known})")
-        stream = self._streams[name]
-        times = self._checked_times(name, stream, time_ns)
-        stored, flags = self._stored(name, stream, times, values)
-        if status is not None:
-            flags = flags | self._column(name, "status", status, len(times), "u2")
         extras = {"time_device": time_device, "time_host": time_host, "seq": seq}
-        rows = self._extras(name, stream, extras, len(times))
-        rows |= {"time": times, stream.variable: stored, "status": flags}
-        for column, block in rows.items():
-            stream.columns[column].append(block)
+        self._streams[name].append(time_ns, values, status, extras)
         self._check_disk()
-        stream.last = int(times[-1]) if len(times) else stream.last
-
-    def _column(self, name: str, column: str, data: ArrayLike, rows: int, kind: str) -> np.ndarray:
-        array = np.asarray(data)
-        if array.shape != (rows,) or array.dtype.kind not in "iu":
-            what = f"{column} has shape {array.shape} and type {array.dtype}"
-            raise self._problem(f"/streams/{name}", what, f"give {rows} integers")
-        limits = np.iinfo(kind)
-        if array.size and (int(array.min()) < limits.min or int(array.max()) > limits.max):
-            what = f"{column} does not fit {np.dtype(kind)}"
-            raise self._problem(f"/streams/{name}", what, "check the numbers")
-        return array.astype(kind)
-
-    def _extras(
-        self, name: str, stream: _Stream, extras: Mapping[str, ArrayLike | None], rows: int
-    ) -> dict[str, np.ndarray]:
-        given = {k: v for k, v in extras.items() if v is not None}
-        if stream.last is None:
-            for key in given:
-                dtype = np.dtype(STREAM_EXTRAS[key])
-                stream.columns.setdefault(key, GrowingArray(stream.group, key, (), dtype))
-        expected = set(stream.columns) & set(STREAM_EXTRAS)
-        if set(given) != expected:
-            what = f"{sorted(given)} given where {sorted(expected)} belong"
-            raise self._problem(f"/streams/{name}", what, "give the same columns with every call")
-        return {k: self._column(name, k, v, rows, STREAM_EXTRAS[k]) for k, v in given.items()}
-
-    def _checked_times(self, name: str, stream: _Stream, time_ns: ArrayLike) -> np.ndarray:
-        times = np.atleast_1d(np.asarray(time_ns))
-        rows = len(times) if times.ndim == 1 else 0
-        times = self._column(name, "time_ns", times, rows, "i8")
-        before = times[:1] - 1 if stream.last is None else np.array([stream.last])
-        steps = np.diff(np.concatenate([before[: rows and None], times])) if rows else times[:0]
-        if (steps <= 0).any():
-            row = int(np.argmax(steps <= 0)) + stream.columns["time"].rows
-            what = f"time does not increase at row {row}"
-            raise self._problem(f"/streams/{name}", what, "sort the rows, drop equal times")
-        return times
-
-    def _stored(
-        self, name: str, stream: _Stream, times: np.ndarray, values: ArrayLike
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Values as stored (n, channels), and the flags that storing them gave rise to (n,)."""
-        if np.ma.isMaskedArray(values):
-            what = "values of a masked array, whose mask would be lost"
-            raise self._problem(f"/streams/{name}", what, "give values.filled(numpy.nan): NaN counts as missing")
-        values = np.asarray(values, np.float64)
-        if values.ndim == 1:
-            values = values.reshape(len(times), -1) if len(times) else values.reshape(0, 1)
-        if values.shape != (len(times), stream.channels):
-            what = f"values of shape {values.shape}"
-            todo = f"give ({len(times)}, {stream.channels}): rows, channels"
-            raise self._problem(f"/streams/{name}", what, todo)
-        stored, clipped = _packed(values, stream)
-        missing = ~np.isfinite(stored) if stored.dtype.kind == "f" else ~np.isfinite(values)
-        flags = np.where(missing.any(axis=1), int(Status.nonfinite), 0)
-        flags = flags | np.where(clipped.any(axis=1), int(Status.saturated), 0)
-        return stored, flags.astype("u2")
-
-    def _finish_stream(self, stream: _Stream) -> None:
-        time = stream.columns["time"].finish(self._time_attrs("time of the sample"))
-        time.make_scale("time")
-        channel = make_index(stream.group, "channel", stream.channels)
-        about = stream.attrs
-        packed = stream.dtype.kind == "i"
-        if packed:
-            about = about | {"scale_factor": stream.scale, "add_offset": stream.offset}
-        values = stream.columns[stream.variable].finish(about)
-        fill = np.iinfo(stream.dtype).min if packed else np.nan
-        values.attrs.create("_FillValue", fill, dtype=stream.dtype)
-        attach(values, time, channel)
-        masks = np.array([int(s) for s in Status], "u2")
-        flags = {"units": "1", "flag_meanings": " ".join(str(s.name) for s in Status)}
-        status = stream.columns["status"].finish(flags)
-        status.attrs.create("flag_masks", masks, dtype="u2")
-        attach(status, time)
-        for key in (k for k in STREAM_EXTRAS if k in stream.columns):
-            attach(stream.columns[key].finish({"units": "1" if key != "time_host" else "ns"}), time)
 
     # --- tables --------------------------------------------------------------------------------
 
@@ -419,20 +255,6 @@ def _truth_axis(group: h5py.Group, name: str, axis: int, size: int) -> h5py.Data
     return make_index(group, f"{name}.{axis}", size)
 
 
-def _packed(values: np.ndarray, stream: _Stream) -> tuple[np.ndarray, np.ndarray]:
-    """Values in the stream's type, and where they had to be clipped."""
-    if stream.dtype.kind == "f":
-        largest = np.finfo(stream.dtype).max
-        stored = np.where(np.abs(values) <= largest, values, np.nan).astype(stream.dtype)
-        return stored, np.zeros(values.shape, bool)
-    limits = np.iinfo(stream.dtype)
-    finite = np.isfinite(values)
-    counts = np.rint((np.where(finite, values, stream.offset) - stream.offset) / stream.scale)
-    clipped = (counts < limits.min + 1) | (counts > limits.max)
-    counts = np.clip(counts, limits.min + 1, limits.max)
-    return np.where(finite, counts, limits.min).astype(stream.dtype), clipped
-
-
 def _utc(path: Path, epoch: datetime) -> str:
     """ISO text in UTC with microseconds; refuses a time without zone."""
     if epoch.tzinfo is None:
@@ -442,48 +264,3 @@ def _utc(path: Path, epoch: datetime) -> str:
     except OverflowError:
         raise problem(path, "epoch", "lies outside of the years 1 to 9999 of UTC", "correct the epoch") from None
     return moment.replace(tzinfo=None).isoformat(timespec="microseconds") + "Z"  # strftime drops zeros of the year
-
-
-def _write_mixing(group: h5py.Group, mixing: sp.csr_array) -> None:
-    """The terms of which readings are sums: reading, row of the pattern, and share of that row."""
-    term = make_index(group, "term", mixing.nnz)
-    reading, row, share = terms_of_mixing(mixing)
-    columns = {
-        "term_reading": (reading.astype("i4"), "reading that the term belongs to"),
-        "term_row": (row.astype("i4"), "row of the pattern"),
-        "term_share": (share.astype("f8"), "share of that row in the reading"),
-    }
-    for name, (values, meaning) in columns.items():
-        attach(make_array(group, name, values, {"units": "1", "long_name": meaning}), term)
-
-
-def _protocol(path: Path, facts: SessionFacts) -> dict[str, Any]:
-    """The protocol's arrays and numbers, checked; empty without a pattern."""
-    if facts.pattern is None:
-        if any(value is not None for value in (facts.current, facts.frequency, facts.offset, facts.mixing)):
-            raise problem(path, "eit_protocol", "has no pattern", "give pattern as well")
-        return {}
-    array = np.asarray(facts.pattern)
-    if array.ndim != 2 or array.shape[1] != 4 or array.dtype.kind not in "iu" or not len(array):
-        raise problem(path, "pattern", f"has shape {array.shape}", "give (M, 4) integers")
-    if array.min() < 0 or array.max() > np.iinfo("i2").max:
-        raise problem(path, "pattern", "names impossible electrodes", "count electrodes from 0")
-    found: dict[str, Any] = {"pattern": array.astype("i2")}
-    for name, value, least in (("current", facts.current, np.nextafter(0, 1)), ("frequency", facts.frequency, 0.0)):
-        if value is not None:
-            found[name] = float(value)
-            if not least <= found[name] < np.inf:
-                raise problem(path, name, f"is {value}", "give a current above zero, a frequency of zero or more")
-    if facts.mixing is not None:
-        try:
-            found["mixing"] = checked_mixing(facts.mixing, len(array))
-        except ValueError as error:
-            raise problem(path, "mixing", str(error), "give that of jaxeit.Protocol") from None
-    if facts.offset is not None:
-        found["offset"] = np.asarray(facts.offset, np.float64)
-        if (
-            found["offset"].shape != (count_readings(array, found.get("mixing")),)
-            or not np.isfinite(found["offset"]).all()
-        ):
-            raise problem(path, "offset", "does not fit the pattern", "give one time per reading")
-    return found
