@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from .belief.filter import Pads
+from .belief.state import Pads
 from .tracker import Tracker
 from .tracks import Tracking
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .belief.filter import CONTACT_SIZE, POSITION_STD, ROUND_HALF_LENGTH, Belief, contact_slice
+from .belief.state import CONTACT_SIZE, POSITION_STD, ROUND_HALF_LENGTH, Belief, contact_slice
 from .settings import TrackerSettings
 
 # Half length of an edge in a hypothesis, m.

@@ -18,8 +18,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from .belief.filter import CONTACT_SIZE, Update
 from .belief.programs import Programs
+from .belief.state import CONTACT_SIZE, Update
 from .events import EventHypotheses, Hypothesis
 from .tracks import MAX_PATIENCE, PATIENCE, Backlog, Look, Observation, Tracking, Trial
 

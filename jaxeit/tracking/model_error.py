@@ -13,8 +13,8 @@ from .._compile import require_known
 from ..contacts.loads.learned.model_error import select_model_error
 from ..imaging.inputs import InverseError, require_real
 from ..messages.kinds import require_unmasked
-from .belief.filter import Pads
 from .belief.layer import LearnedLayer
+from .belief.state import Pads
 from .looks import has_converged
 from .preparation import MESH_ERROR_RATIO
 from .tracker import Tracker

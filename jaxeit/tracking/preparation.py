@@ -26,10 +26,11 @@ from ..model.scene import Scene
 from ..model.sensitivity import pair_jacobian
 from ..skin.description import Skin
 from .belief.apparent_gain import apparent_gain
-from .belief.filter import CONTACT_SIZE, POSITION_STD, ContactFilter
+from .belief.contact_filter import ContactFilter
 from .belief.layer import GainField
 from .belief.reanalysis import prepare_reanalysis
 from .belief.response import LoadedSheet, NeighbourTable, edge_half_lengths
+from .belief.state import CONTACT_SIZE, POSITION_STD
 from .settings import TrackerSettings
 
 # Cells of the grid of neighbours, along the longer side.

@@ -24,7 +24,8 @@ import numpy as np
 from jaxtyping import Float
 
 from .belief.consider import ConsiderErrors
-from .belief.filter import CONTACT_SIZE, Belief, contact_slice, predict
+from .belief.contact_filter import predict
+from .belief.state import CONTACT_SIZE, Belief, contact_slice
 from .tracker import Tracker
 from .tracks import Track, Tracking, track_of
 

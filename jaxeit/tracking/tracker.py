@@ -20,9 +20,10 @@ from ..messages.kinds import require_kind, require_unmasked
 from ..model.discretisation import Model, require_model
 from ..skin.description import Skin
 from .belief.consider import ConsiderErrors
-from .belief.filter import CONTACT_SIZE, LOAD_SIZE, MIN_PAD_SHARE, Belief, ContactFilter, Pads, Update
+from .belief.contact_filter import MIN_PAD_SHARE, ContactFilter
 from .belief.layer import GainField, LearnedLayer
 from .belief.programs import Programs
+from .belief.state import CONTACT_SIZE, LOAD_SIZE, Belief, Pads, Update
 from .events import EventHypotheses
 from .looks import (
     advance_look,
@@ -264,7 +265,8 @@ class Tracker:
     def look(self, now: Tracking) -> Tracking:
         """A piece more of what is left to be explained, if anything is: `Tracking.backlog`.
 
-        A piece is at most `filter.MAX_STEPS` evaluations of what contacts show, as an ordinary frame, and mostly two.
+        A piece is at most `frame_update.MAX_STEPS` evaluations of what contacts show, as an ordinary frame, and mostly
+        two.
         """
         backlog = now.backlog
         if backlog is None:

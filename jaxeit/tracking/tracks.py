@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from .belief.consider import ConsiderErrors
-from .belief.filter import Attempt, Belief, Pads, contact_slice
 from .belief.layer import LearnedLayer
+from .belief.state import Attempt, Belief, Pads, contact_slice
 from .events import Hypothesis
 
 # Number of frames after which a frame that no event explains is looked into again: twice as many each time that nothing

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxeit.tracking.belief.filter import MAX_STEPS, PIECE_STEPS, Pads
+from jaxeit.tracking.belief.frame_update import MAX_STEPS, PIECE_STEPS
 from jaxeit.tracking.belief.programs import Programs
+from jaxeit.tracking.belief.state import Pads
 from jaxeit.tracking.events import allow_jumps
 from jaxeit.tracking.looks import (
     MAX_WAIT,

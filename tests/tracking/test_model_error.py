@@ -8,8 +8,8 @@ from scipy.stats import chi2
 from jaxeit.contacts.loads.learned.model_error import ERROR_RATIO
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import fit_model_error, model_error, press_evidence
-from jaxeit.tracking.belief.filter import CONTACT_SIZE
 from jaxeit.tracking.belief.programs import Programs
+from jaxeit.tracking.belief.state import CONTACT_SIZE
 from jaxeit.tracking.preparation import MESH_ERROR_RATIO
 
 from .conftest import SECONDS, load

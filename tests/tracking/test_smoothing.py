@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from jaxeit.tracking.belief.filter import CONTACT_SIZE as SIZE
+from jaxeit.tracking.belief.state import CONTACT_SIZE as SIZE
 from jaxeit.tracking.smoothing import Smoother, State, Transition, smooth, transition_after
 
 FRAMES, SEEN = 7, 3

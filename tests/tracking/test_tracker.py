@@ -7,16 +7,9 @@ from scipy.stats import norm
 
 from jaxeit.imaging import InverseError
 from jaxeit.tracking import TrackerSettings, prepare_tracker
-from jaxeit.tracking.belief.filter import (
-    CONTACT_SIZE,
-    LOAD_SIZE,
-    TAIL_WIDTH_RATIO,
-    Pads,
-    active_indices,
-    informative_pads,
-    predict,
-    update,
-)
+from jaxeit.tracking.belief.contact_filter import TAIL_WIDTH_RATIO, active_indices, informative_pads, predict
+from jaxeit.tracking.belief.frame_update import update
+from jaxeit.tracking.belief.state import CONTACT_SIZE, LOAD_SIZE, Pads
 
 from .conftest import SECONDS, SETTINGS, in_double_precision, load, with_filter
 

@@ -18,8 +18,9 @@ from jaxtyping import Array, Float, Int
 
 from ..._compile import verb
 from ...linalg import lapack
-from .filter import CONTACT_SIZE, LOAD_SIZE, ContactFilter, active_indices
+from .contact_filter import ContactFilter, active_indices
 from .response import LoadedSheet
+from .state import CONTACT_SIZE, LOAD_SIZE
 
 # Distance of presses, in lengths of the field of the gain, and limits of their number along a side.
 PITCH_RATIO, GRID_LIMITS = 1.6, (2, 12)

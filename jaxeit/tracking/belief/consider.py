@@ -21,7 +21,8 @@ from jaxtyping import Array, Float
 
 from ..._compile import verb
 from ...linalg import lapack
-from .filter import LOAD_SIZE, ROUND_HALF_LENGTH, Belief, ContactFilter, Pads, active_indices, informative_pads
+from .contact_filter import ContactFilter, active_indices, informative_pads
+from .state import LOAD_SIZE, ROUND_HALF_LENGTH, Belief, Pads
 
 # Number n of frames, each with an error of the model of its own, after which the frames outweigh P.
 REST_FRAMES = 10

@@ -8,18 +8,9 @@ from jaxtyping import Array, Float
 
 from ..._compile import bind
 from .consider import consider_covariance
-from .filter import (
-    Attempt,
-    Belief,
-    ContactFilter,
-    Pads,
-    Update,
-    advance,
-    conclude,
-    innovation,
-    predict,
-    predict_and_update,
-)
+from .contact_filter import ContactFilter, predict
+from .frame_update import advance, conclude, innovation, predict_and_update
+from .state import Attempt, Belief, Pads, Update
 
 # Most positions from which the fit of a new contact starts, and their least distance, m.
 MAX_STARTS, MIN_START_DISTANCE = 4, 0.01
@@ -50,17 +41,17 @@ class Programs:
     def predict_and_update(
         self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads, seconds: float
     ) -> tuple[Belief, Update]:
-        """See `filter.predict_and_update`."""
+        """See `frame_update.predict_and_update`."""
         return self._predict_and_update(_as_arrays(belief), dv, pads, np.asarray(seconds, self._dtype))
 
     def predict(self, belief: Belief, seconds: float) -> Belief:
-        """See `filter.predict`."""
+        """See `contact_filter.predict`."""
         return self._predict(_as_arrays(belief), np.asarray(seconds, self._dtype))
 
     def advance(
         self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads, attempt: Attempt | None
     ) -> Attempt:
-        """See `filter.advance`."""
+        """See `frame_update.advance`."""
         return self._advance(_as_arrays(belief), dv, pads, attempt)
 
     def single_frame_update(self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads) -> Update:
@@ -75,7 +66,7 @@ class Programs:
         return attempt
 
     def conclude(self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads, attempt: Attempt) -> Update:
-        """See `filter.conclude`."""
+        """See `frame_update.conclude`."""
         return self._conclude(_as_arrays(belief), dv, pads, attempt)
 
     def consider_covariance(self, belief: Belief, pads: Pads, unexplained: float) -> Float[np.ndarray, "K 6 6"]:
@@ -100,7 +91,7 @@ class Programs:
             score = np.where(np.linalg.norm(self._starts - place, axis=1) < MIN_START_DISTANCE, -np.inf, score)
 
     def innovation(self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads) -> Float[np.ndarray, " r"]:
-        """See `filter.innovation`."""
+        """See `frame_update.innovation`."""
         return np.asarray(self._innovation(_as_arrays(belief), dv, pads))
 
 
