@@ -41,7 +41,8 @@ from .logs.procedure import apply_log, calibrate_logs, evaluate_log
 from .logs.recalibration import assess_log, recalibrate_log
 from .procedure import calibrate, evaluate
 from .recalibration.changes import Recalibration
-from .recalibration.procedure import AbstractEvidence, KnownForces, OrdinaryUse, assess, recalibrate
+from .recalibration.evidence import AbstractEvidence, KnownForces, OrdinaryUse
+from .recalibration.procedure import assess, recalibrate
 from .recipes.recipe import Recipe, RecipeError
 
 __all__ = [

@@ -20,18 +20,11 @@ from jaxeit.tracking import LearnedLayer
 from ..calibration.application.force_maps import ForceModel
 from ..calibration.calibration import Calibration
 from ..calibration.recalibration.changes import Evidence, Recalibration
+from ..calibration.recalibration.evidence import gain_prior, image_reference, update_from_use
+from ..calibration.recalibration.loads import ObservedContacts, contact_loads, seen_contacts
 from ..calibration.recalibration.ordinary_use import loaded_pressures
 from ..calibration.recalibration.press_noise import press_noise
-from ..calibration.recalibration.procedure import (
-    ObservedContacts,
-    contact_loads,
-    gain_prior,
-    image_reference,
-    recorded,
-    rest_levels,
-    seen_contacts,
-    update_from_use,
-)
+from ..calibration.recalibration.records import recorded, rest_levels
 from ..fitting.gain_update import GainDrift, GainUpdate
 from ..fitting.pad_gains import PadGains
 

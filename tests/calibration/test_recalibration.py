@@ -16,9 +16,10 @@ from calib.calibration.fitted_sessions import SAME_NOTE, is_fitted
 from calib.calibration.recalibration.agreement import covariance_of_moves
 from calib.calibration.recalibration.changes import Advice, Evidence, render
 from calib.calibration.recalibration.image_reference import fit_reference
+from calib.calibration.recalibration.loads import LoadedPads, ObservedContacts, contact_loads
 from calib.calibration.recalibration.ordinary_use import distinct, loaded_pressures, quiet_range, zero_and_loads
 from calib.calibration.recalibration.press_noise import press_noise
-from calib.calibration.recalibration.procedure import LoadedPads, ObservedContacts, contact_loads, recorded, rest_levels
+from calib.calibration.recalibration.records import recorded, rest_levels
 from calib.cli import main
 from calib.fitting.gain_update import GainDrift, GainPrior, GainUpdate, relative_covariance, update_gains
 from calib.fitting.intervals import NORMAL_MULTIPLE

@@ -20,9 +20,11 @@ from ...session import Session, SessionError
 from ..calibration import Calibration
 from ..localisation.press_images import PressImages
 from .changes import Advice, Recalibration
+from .evidence import KnownForces, OrdinaryUse
+from .loads import LoadedPads, estimator_of, use_loads
 from .ordinary_use import MAX_OBSERVATIONS
 from .press_noise import place_spacing
-from .procedure import MIN_SHARE, KnownForces, LoadedPads, OrdinaryUse, estimator_of, judge, use_loads
+from .procedure import MIN_SHARE, judge
 from .skins import other_skin
 
 # Change of a level at rest, as a part of the largest calibrated pressure, from which it is worth a line. The level
