@@ -107,14 +107,7 @@ from .base import (
     AbstractSheetEffect,
     AbstractStageEffect,
     AbstractTerminalEffect,
-    Circuit,
     EffectError,
-    HistoryInputs,
-    Indenter,
-    Packets,
-    Path,
-    Sheet,
-    StreamKind,
     chosen,
     fold,
     history,
@@ -147,6 +140,7 @@ from .pneumatics import (
     SensorError,
     TpuRelaxation,
 )
+from .quantities import Circuit, HistoryInputs, Indenter, Packets, Path, Sheet, StreamKind
 from .readout import (
     AdcRanges,
     BaselineDrift,

@@ -5,7 +5,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from .base import AbstractClockEffect, Packets, StreamKind, parameter
+from .base import AbstractClockEffect, parameter
+from .quantities import Packets, StreamKind
 
 # Limits of `ClockError`: times since 1970 and their sums with delays fit nanoseconds in 64 bits.
 MOST_SKEW, LARGEST_TIME, LONGEST_DELAY = 1.0, 4e9, 3600.0  # 1, s, s

@@ -4,8 +4,9 @@ from typing import ClassVar
 
 from jaxtyping import Array, Float
 
-from .base import AbstractCoatEffect, Sheet, parameter
+from .base import AbstractCoatEffect, parameter
 from .material import power
+from .quantities import Sheet
 
 
 class ContinuousCoating(AbstractCoatEffect):

@@ -5,7 +5,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .base import MOST_STD, AbstractContactEffect, AbstractTerminalEffect, Circuit, parameter
+from .base import MOST_STD, AbstractContactEffect, AbstractTerminalEffect, parameter
+from .quantities import Circuit
 from .random import own_normal
 
 

@@ -10,18 +10,8 @@ from jax.scipy.special import i0e, i1e
 from jaxtyping import Array, Float, Int
 
 from ..registry import computed
-from .base import (
-    MOST_STD,
-    AbstractMemoryEffect,
-    AbstractSheetEffect,
-    HistoryInputs,
-    Series,
-    Sheet,
-    State,
-    metres,
-    parameter,
-    require_relation,
-)
+from .base import MOST_STD, AbstractMemoryEffect, AbstractSheetEffect, metres, parameter, require_relation
+from .quantities import HistoryInputs, Series, Sheet, State
 from .random import own_field
 
 PLAY_OPERATORS = 8

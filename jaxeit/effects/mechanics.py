@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from .base import MOST_STD, AbstractLoadEffect, AbstractStageEffect, Indenter, Path, metres, parameter
+from .base import MOST_STD, AbstractLoadEffect, AbstractStageEffect, metres, parameter
+from .quantities import Indenter, Path
 from .random import normal
 
 RIM_COSINES = np.cos(np.pi * (np.arange(32) + 0.5) / 32)

@@ -12,16 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, DTypeLike, Float, Int
 
-from .base import (
-    AbstractPadEffect,
-    AbstractPneumaticEffect,
-    HistoryInputs,
-    Series,
-    State,
-    metres,
-    parameter,
-    require_relation,
-)
+from .base import AbstractPadEffect, AbstractPneumaticEffect, metres, parameter, require_relation
+from .quantities import HistoryInputs, Series, State
 from .random import own_normal
 
 

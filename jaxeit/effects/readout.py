@@ -8,16 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .base import (
-    AbstractReadoutEffect,
-    AbstractScanEffect,
-    HistoryInputs,
-    Series,
-    State,
-    StreamKind,
-    parameter,
-    require_relation,
-)
+from .base import AbstractReadoutEffect, AbstractScanEffect, parameter, require_relation
+from .quantities import HistoryInputs, Series, State, StreamKind
 from .random import normal, own_normal
 
 POLE_RATIO = 4.0

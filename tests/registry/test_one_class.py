@@ -28,7 +28,8 @@ SOURCES = {
 
 from jaxtyping import Array, Float
 
-from .base import AbstractSheetEffect, Sheet, parameter
+from .base import AbstractSheetEffect, parameter
+from .quantities import Sheet
 
 
 class Wetness(AbstractSheetEffect):
