@@ -19,7 +19,7 @@ import numpy as np
 import calib
 import jaxeit as je
 from calib.calibration.application.force_maps import force_model
-from calib.live.engine import FramePrograms
+from calib.live.frame_programs import FramePrograms
 
 from .bench_live import made_up
 from .harness import Question, Run, with_one_blas_thread

@@ -16,7 +16,8 @@ import calib
 import jaxeit as je
 from calib.calibration.application.frame_blocks import FrameBlocks, estimated
 from calib.live.engine import Engine
-from calib.live.loop import FrameQueue, LiveControl
+from calib.live.frame_queue import FrameQueue
+from calib.live.loop import LiveControl
 from calib.live.views.page import Page
 from calib.presses.table import resting_levels
 from calib.record.plan import StreamPlan

@@ -31,9 +31,11 @@ from calib.fitting.curves.fitted import FittedCurve
 from calib.fitting.fields.places import single_places
 from calib.fitting.pads import PadModel
 from calib.live import engine as live_engine, loop as live_module
-from calib.live.engine import PREPARING, Engine, FrameForces, FramePrograms, ReceivedFrame, RestAverage
+from calib.live.engine import PREPARING, Engine, ReceivedFrame, RestAverage
 from calib.live.follower import PIECES, LiveFollower
-from calib.live.loop import FrameQueue, LiveControl, LiveError, LiveSettings, _tell_state, run_live
+from calib.live.frame_programs import FrameForces, FramePrograms
+from calib.live.frame_queue import FrameQueue
+from calib.live.loop import LiveControl, LiveError, LiveSettings, _tell_state, run_live
 from calib.live.results import TouchEstimates
 from calib.live.scan_control import ScanDirector, prepare_director
 from calib.live.views.page import MAX_CONNECTIONS, Page
