@@ -265,8 +265,7 @@ class Tracker:
     def look(self, now: Tracking) -> Tracking:
         """A piece more of what is left to be explained, if anything is: `Tracking.backlog`.
 
-        A piece is at most `frame_update.MAX_STEPS` evaluations of what contacts show, as an ordinary frame, and mostly
-        two.
+        A piece takes at most `frame_update.MAX_STEPS` evaluations of the measurement model, and mostly two.
         """
         backlog = now.backlog
         if backlog is None:
