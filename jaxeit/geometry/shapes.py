@@ -8,22 +8,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..budget import require
 from ..messages.kinds import is_number, shown
-
-Vectors = TypeVar("Vectors", np.ndarray, Array)
-
-TOLERANCE = 1e-9
-"""Points this close to the rim, relative to the domain's diagonal, count as being on it."""
-
-BLOCK = 1 << 20
-"""Largest number of pairs, of a point and a side or of two sides, that are compared at once: this bounds memory."""
+from .plane_vectors import cross, signed_area
+from .simple_polygons import BLOCK, TOLERANCE, require_polygon
 
 
 class Domain(ABC):
@@ -281,14 +273,14 @@ class Polygon(_Polygonal):
 
     def __post_init__(self) -> None:
         points = np.asarray(self.vertices, float)
-        _require_polygon(points)
-        if _signed_area(points) < 0:
+        require_polygon(points)
+        if signed_area(points) < 0:
             points = np.roll(points[::-1], 1, axis=0)
         object.__setattr__(self, "vertices", tuple((float(x), float(y)) for x, y in points))
 
     @property
     def area(self) -> float:
-        return float(_signed_area(self.corner_points))
+        return float(signed_area(self.corner_points))
 
     @cached_property
     def corner_points(self) -> np.ndarray:
@@ -320,100 +312,7 @@ def _by_blocks(function: Callable[[np.ndarray], np.ndarray], values: np.ndarray,
     return np.concatenate([function(values[start : start + rows]) for start in range(0, len(values), rows)])
 
 
-def cross(a: Vectors, b: Vectors) -> Vectors:
-    """z component of the cross product of plane vectors (..., 2), in NumPy or in JAX; NumPy >= 2.5 has none."""
-    product: Vectors = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return product
-
-
 def _require_positive(what: str, **sizes: float) -> None:
     for name, value in sizes.items():
         if not (is_number(value) and np.isfinite(value) and value > 0):
             raise ValueError(f"{what}: {name} is {shown(value)}; give a positive length in metres")
-
-
-def _signed_area(points: np.ndarray) -> float:
-    # Relative to the first vertex, so that a polygon far from the origin loses no digits to cancellation.
-    points = points - points[0]
-    return 0.5 * float(np.sum(cross(points, np.roll(points, -1, axis=0))))
-
-
-def _require_polygon(points: np.ndarray) -> None:
-    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
-        raise ValueError(f"Polygon: vertices have shape {points.shape}; give three or more (x, y) pairs")
-    if not np.all(np.isfinite(points)):
-        row = int(np.flatnonzero(~np.isfinite(points).all(1))[0])
-        raise ValueError(f"Polygon: vertex {row} is {points[row]}; give finite metres")
-    require("corners", len(points), "Polygon")
-    _require_simple(points)
-
-
-def _require_simple(points: np.ndarray) -> None:
-    """Raise ValueError for a rim that meets itself: two sides that share more than one corner."""
-    tolerance = TOLERANCE * float(np.linalg.norm(np.ptp(points, axis=0)))
-    steps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
-    if np.any(steps <= tolerance):
-        row = int(np.argmin(steps))
-        raise ValueError(
-            f"Polygon: vertices {row} and {(row + 1) % len(points)} coincide at {points[row]}; "
-            "remove one (the last vertex need not repeat the first)"
-        )
-    first, second = _meeting_sides(points, tolerance)
-    if len(first):
-        raise ValueError(
-            f"Polygon: the sides from vertices {first[0]} and {second[0]} meet; "
-            "give the corners in order along the rim, without crossing or touching"
-        )
-
-
-def _meeting_sides(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of sides that cross, touch or fold back on each other; the numbers of both sides, (pairs,) each."""
-    n = len(points)
-    first, second = _close_sides(points, tolerance)
-    distance = _segment_distance(points[first], points[(first + 1) % n], points[second], points[(second + 1) % n])
-    neighbours = (second == first + 1) | ((first == 0) & (second == n - 1))
-    meet = np.where(neighbours, _folds_back(points, first, second), distance <= tolerance)
-    return first[meet], second[meet]
-
-
-def _close_sides(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of sides, the lower number first, whose bounding boxes meet."""
-    n, ends = len(points), np.stack([points, np.roll(points, -1, axis=0)])
-    low, high = ends.min(0) - tolerance, ends.max(0) + tolerance
-    rows = max(1, BLOCK // n)
-    found = []
-    for start in range(0, n, rows):
-        part = slice(start, start + rows)
-        meets = ((low[part, None] <= high) & (low <= high[part, None])).all(-1)
-        found.append(np.argwhere(np.triu(meets, start + 1)) + np.array([start, 0]))
-    first, second = np.concatenate(found).T
-    return first, second
-
-
-def _folds_back(points: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Whether two sides that share a corner run back over each other."""
-    sides = np.roll(points, -1, axis=0) - points
-    a, b = sides[first], sides[second]
-    scale = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-    return np.asarray((np.abs(cross(a, b)) <= TOLERANCE * scale) & ((a * b).sum(1) < 0))
-
-
-def _segment_distance(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Distance of the segments a-b and c-d, row by row; 0 where they cross."""
-    ends = np.stack(
-        [
-            _point_segment(a, c, d),
-            _point_segment(b, c, d),
-            _point_segment(c, a, b),
-            _point_segment(d, a, b),
-        ]
-    ).min(0)
-    crosses = (cross(b - a, c - a) * cross(b - a, d - a) < 0) & (cross(d - c, a - c) * cross(d - c, b - c) < 0)
-    return np.where(crosses, 0.0, ends)
-
-
-def _point_segment(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Distance of the points p from the segments a-b, row by row."""
-    along = ((p - a) * (b - a)).sum(-1) / ((b - a) ** 2).sum(-1)
-    distance: np.ndarray = np.linalg.norm(p - a - np.clip(along, 0.0, 1.0)[..., None] * (b - a), axis=-1)
-    return distance

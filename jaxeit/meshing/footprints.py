@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..geometry.shapes import Domain, cross
+from ..geometry.plane_vectors import cross
+from ..geometry.shapes import Domain
 
 RIM_MARGIN = 1.02
 """Least distance of a round outline from the rim, over its meshed radius: triangles need room between the two."""

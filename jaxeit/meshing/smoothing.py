@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import Delaunay, cKDTree
 
-from ..geometry.shapes import Domain, cross
+from ..geometry.plane_vectors import cross
+from ..geometry.shapes import Domain
 from .sizes import SizeField, thin
 
 GOOD_ANGLE = 30.0

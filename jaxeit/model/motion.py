@@ -19,17 +19,16 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from .._compile import is_traced, require_known, verb
-from ..geometry.shapes import cross
+from ..geometry.plane_vectors import cross
 from ..linalg.base import on_device
 from ..meshing.elements import BY_ORDER, P1, element_slopes
+from ..meshing.rim_nodes import RimNodes
 from ..meshing.triangles import Mesh
 from .discretisation import Model, require_model
 from .forward_model import Coefficients, Fields, coefficients, fields, series_resistance, terminal_matrix, voltages
 from .matrix.stiffness import TableBatch
 from .matrix.system import Entries, System, stiffness_places
 
-# The cosine between rim edges that meet in a corner, which no electrode passes.
-CORNER = np.cos(np.radians(30))
 # Parts of an electrode's radius that the mesh needs around it, so that its triangles are not flattened.
 LEAST_REACH = 1.25
 # In a batch, whose products of fields stay in a core's cache.
@@ -135,7 +134,7 @@ class _NodeDisplacement(NamedTuple):
 
 
 def _follow(mesh: Mesh, electrodes: list[np.ndarray]) -> _NodeDisplacement:
-    rim = _Rim(mesh)
+    rim = RimNodes(mesh)
     middles = np.stack([mesh.chart[nodes].mean(0) for nodes in electrodes])
     away = np.linalg.norm(mesh.chart[:, None] - middles, axis=2)
     radii = np.array([away[nodes, k].max() for k, nodes in enumerate(electrodes)])
@@ -162,28 +161,6 @@ def _follow(mesh: Mesh, electrodes: list[np.ndarray]) -> _NodeDisplacement:
     bound = along[:, :, None] * own[follows][:, None, :]  # the part along the rim, turned with the rim
     step = share[:, None, None] * np.where(on_rim[follows][:, None, None], bound, np.eye(2))
     return _NodeDisplacement(follows, step, mesh.chart - middles[follows], radii, reach)
-
-
-class _Rim:
-    """Which nodes lie on the rim (inside it), its direction at each of them, and its corners."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        first, second = mesh.boundary_edges.T
-        sides = mesh.chart[second] - mesh.chart[first]
-        sides /= np.linalg.norm(sides, axis=1, keepdims=True)
-        self.inside = np.zeros(len(mesh.nodes), bool)
-        self.inside[first] = True
-        out, into = np.zeros_like(mesh.chart), np.zeros_like(mesh.chart)
-        out[first], into[second] = sides, sides
-        self.corner = self.inside & ((out * into).sum(1) < CORNER)
-        both = out + into
-        self.tangent = both / np.maximum(np.linalg.norm(both, axis=1, keepdims=True), np.finfo(float).tiny)
-
-    def direction(self, nodes: np.ndarray) -> np.ndarray:
-        """The direction of the rim at an electrode, (2,)."""
-        mean = self.tangent[nodes].mean(0)
-        unit: np.ndarray = mean / np.linalg.norm(mean)
-        return unit
 
 
 def moved(
