@@ -24,9 +24,5 @@ from .images import (
 )
 from .misplacement import Misplacement as Misplacement, find_misplacement as find_misplacement
 from .one_frame import AbsoluteImage as AbsoluteImage, absolute_image as absolute_image
-from .reference import (
-    ReferenceFit as ReferenceFit,
-    ReferenceParameters as ReferenceParameters,
-    ReferenceSettings as ReferenceSettings,
-    fit_reference as fit_reference,
-)
+from .reference import ReferenceFit as ReferenceFit, fit_reference as fit_reference
+from .reference_unknowns import ReferenceParameters as ReferenceParameters, ReferenceSettings as ReferenceSettings

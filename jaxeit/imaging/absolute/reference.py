@@ -9,9 +9,8 @@ ones are found through the full forward map by `LevenbergMarquardt`; their covar
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,7 +19,6 @@ import numpy as np
 import optimistix as optx
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Integer
-from scipy.linalg import block_diag
 
 from ..._compile import full_precision, is_traced, verb
 from ...effects import CommonMode, chosen
@@ -29,75 +27,25 @@ from ...least_squares.levenberg_marquardt import gauss_newton_solver
 from ...linalg.lapack import eigh
 from ...model.discretisation import Model, require_model
 from ...model.forward_model import forward
-from ...model.motion import Motion, electrode_motion, moved
-from ...registry import limited, require_limits
-from ...registry.limits import LONGEST
+from ...model.motion import electrode_motion
 from ..inputs import ConvergenceError, InverseError, require_real
 from .frames import MAX_UNEXPLAINED, checked_errors, checked_frame, frame_error, require_explained, sheet_level
 from .images import reading_weights
+from .reference_unknowns import (
+    MODEL_ERROR,
+    ReferenceParameters,
+    ReferenceProblem,
+    ReferenceSettings,
+    prior_root,
+    split_unknowns,
+)
 
-MODEL_ERROR = 3e-3
-"""Standard error of a reading, relative, where nothing else is said: that of the mesh and the places of electrodes."""
 MESH_LENGTH = {3: 0.12, 6: 0.025}
 """Contact resistance of an electrode on the rim that its mesh is off by, times the conductivity and over the length of
 an edge of the mesh, by the unknowns of an element: linear, quadratic. Against the exact solution of the disc it is 0.09
 to 0.13 and 0.003 to 0.035."""
 FITS = 3  # each with errors as large as the misfit of the fit before, the first with what even content leaves
 TOLERANCE, MAX_STEPS = 1e-6, 256  # tolerance of the sum of squares: 1 is one standard error
-
-
-class ReferenceSettings(eqx.Module):
-    """Standard deviations before the frame is seen. What has the deviation zero stays as the model has it.
-
-    | meaning                                                                  | default | unit |
-    |--------------------------------------------------------------------------|---------|------|
-    | level: of the logarithm of the conductivity; 0: the content is known     | 3       | 1    |
-    | contact: of the logarithm of what all contact resistances have in common | 3       | 1    |
-    | contact_each: of the logarithm of each one's own part; 0: all are alike  | 1       | 1    |
-    | gain: of each channel, relative                                          | 0       | 1    |
-    | offset: of each channel                                                  | 0       | V    |
-    | shift: of each electrode in each direction                               | 0       | m    |
-    | common_mode: of the amplifiers' gain for the common-mode voltage         | 0       | 1    |
-    | scale: of what all readings have in common: mesh, size, current          | 0.003   | 1    |
-
-    With ``scale`` zero the mesh is taken as exact, in the errors of contacts too.
-    """
-
-    level: float = limited(3.0, least=0)
-    contact: float = limited(3.0, least=0)
-    contact_each: float = limited(1.0, least=0)
-    gain: float = limited(0.0, least=0)
-    offset: float = limited(0.0, least=0, unit="V")
-    shift: float = limited(0.0, least=0, most=LONGEST, unit="m")
-    common_mode: float = limited(0.0, least=0)
-    scale: float = limited(MODEL_ERROR, least=0)
-
-    def __check_init__(self) -> None:
-        require_limits(self, InverseError)
-        if not any(value for name, value in vars(self).items() if name != "scale"):
-            raise InverseError("all standard deviations are zero; give one above zero to what is unknown")
-
-
-class ReferenceParameters(NamedTuple):
-    """One number for each unknown, whatever it says of them: values, standard deviations or a direction.
-
-    | meaning                                                       | shape           |
-    |---------------------------------------------------------------|-----------------|
-    | level: of the conductivity                                    | ()              |
-    | contact: of the specific contact resistance of each electrode | (electrodes,)   |
-    | gain, offset: of each channel                                 | (channels,)     |
-    | shift: of each electrode                                      | (electrodes, 2) |
-    | common_mode: gain of `je.effects.CommonMode`                  | ()              |
-    | scale: of all readings, relative to 1                         | ()              |
-    """
-
-    level: Float[Array, ""]
-    contact: Float[Array, " electrodes"]
-    gain: Float[Array, " channels"]
-    offset: Float[Array, " channels"]
-    shift: Float[Array, "electrodes 2"]
-    common_mode: Float[Array, ""]
-    scale: Float[Array, ""]
 
 
 class ReferenceFit(eqx.Module):
@@ -142,7 +90,7 @@ class ReferenceFit(eqx.Module):
         """
         electrodes, channels = self.model.electrodes, len(self.value.gain)
         found = np.asarray(self.directions)[np.asarray(self.information) < 1]
-        return [_parts(jnp.asarray(direction), electrodes, channels) for direction in found]
+        return [split_unknowns(jnp.asarray(direction), electrodes, channels) for direction in found]
 
 
 @full_precision
@@ -190,11 +138,11 @@ def fit_reference(
     each = _channels(model, channel) if settings.gain or settings.offset else None
     channels = 0 if each is None else int(each.max()) + 1
     motion = electrode_motion(model) if settings.shift else None
-    spread = jnp.asarray(_spread(model, settings, channels), model.dtype)
+    spread = jnp.asarray(prior_root(model, settings, channels), model.dtype)
     numbers = None if each is None else jnp.asarray(each, jnp.int32)
     touches, amplifies = bool(settings.contact or settings.contact_each), bool(settings.common_mode)
     meshed = touches and bool(settings.scale)
-    problem = _Problem(model, motion, numbers, channels, touches, meshed, amplifies, level, spread)
+    problem = ReferenceProblem(model, motion, numbers, channels, touches, meshed, amplifies, level, spread)
     x, used, converged = _repeated(problem, known, weight, _rms(weight * (known - even / level)), std is None)
     fit, found = _described(problem, known, used, jnp.where(converged, x, jnp.nan))
     used = jnp.where(converged, used, 0)
@@ -233,87 +181,8 @@ def _channels(model: Model, channel: Integer[ArrayLike, " readings"] | None) -> 
     return channels
 
 
-def _spread(model: Model, settings: ReferenceSettings, channels: int) -> np.ndarray:
-    """The unknowns, (n, k), from k independent ones of unit variance, as they are before the frame is seen."""
-    touching = np.asarray(model.contact) > 0
-    if not touching.any() and (settings.contact or settings.contact_each):
-        raise InverseError(
-            "no electrode of the model has a contact resistance to fit, and point electrodes cannot have one; give the "
-            "electrodes a contact above zero, or fit none: contact=0 and contact_each=0, or no --fit-contacts"
-        )
-    if settings.common_mode and not chosen(model.effects, CommonMode):
-        raise InverseError("the scene has no CommonMode whose gain could be fitted; add je.effects.CommonMode() to it")
-    blocks = [
-        np.array([[settings.level]]),
-        _alike(touching, settings.contact, settings.contact_each),
-        settings.gain * np.eye(channels),
-        settings.offset * np.eye(channels),
-        settings.shift * np.eye(2 * model.electrodes),
-        np.array([[settings.common_mode]]),
-        np.array([[settings.scale]]),
-    ]
-    whole: np.ndarray = block_diag(*blocks)
-    return whole[:, whole.any(0)]
-
-
-def _alike(touching: np.ndarray, together: float, each: float) -> np.ndarray:
-    """A root of the covariance ``together^2 1 1^T + each^2 I`` of what touches, of as many columns as it has ranks."""
-    ones, count = touching.astype(float)[:, None], max(1, int(touching.sum()))
-    if not each:
-        return together * ones
-    more = (np.hypot(each, np.sqrt(count) * together) - each) / count
-    root: np.ndarray = each * np.diag(ones[:, 0]) + more * ones @ ones.T
-    return root
-
-
-def _parts(values: Float[Array, " n"], electrodes: int, channels: int) -> ReferenceParameters:
-    """The unknowns, apart."""
-    counts = [1, electrodes, channels, channels, 2 * electrodes, 1]
-    level, contact, gain, offset, shift, common, scale = jnp.split(values, np.cumsum(counts))
-    return ReferenceParameters(level[0], contact, gain, offset, shift.reshape(electrodes, 2), common[0], scale[0])
-
-
-class _Problem(eqx.Module):
-    """The readings as a function of the unknowns."""
-
-    model: Model
-    motion: Motion | None
-    channel: Int[Array, " readings"] | None
-    channels: int = eqx.field(static=True)
-    touches: bool = eqx.field(static=True)  # whether contacts are fitted
-    meshed: bool = eqx.field(static=True)  # whether their errors are those of the mesh too
-    amplifies: bool = eqx.field(static=True)  # whether the gain for the common mode is
-    level: Float[Array, ""]  # conductivity to begin with, over the model's
-    spread: Float[Array, "n k"]
-
-    def parts(self, x: Float[Array, " k"]) -> ReferenceParameters:
-        """The unknowns, from those of unit variance."""
-        return _parts(self.spread @ x, self.model.electrodes, self.channels)
-
-    def there(self, parts: ReferenceParameters) -> Model:
-        """The model with these unknowns."""
-        model = self.model if self.motion is None else moved(self.model, self.motion, parts.shift)
-        background = self.level * jnp.exp(parts.level) * model.background
-        contact = self.level * jnp.exp(-parts.contact) * model.contact if self.touches else model.contact
-        effects = tuple(
-            eqx.tree_at(lambda e: e.gain, effect, effect.gain + parts.common_mode)
-            if self.amplifies and isinstance(effect, CommonMode)
-            else effect
-            for effect in model.effects
-        )
-        return replace(model, background=background, contact=contact, effects=effects)
-
-    def read(self, x: Float[Array, " k"]) -> Float[Array, " readings"]:
-        """The frame, V."""
-        parts = self.parts(x)
-        readings = (1 + parts.scale) * forward(self.there(parts))
-        if self.channel is None:
-            return readings
-        return (1 + parts.gain[self.channel]) * readings + parts.offset[self.channel]
-
-
 def _repeated(
-    problem: _Problem,
+    problem: ReferenceProblem,
     known: Float[Array, " readings"],
     weight: Float[Array, " readings"],
     growth: Float[Array, ""],
@@ -346,7 +215,10 @@ def _repeated(
 
 @verb
 def _most_probable(
-    problem: _Problem, known: Float[Array, " readings"], weight: Float[Array, " readings"], start: Float[Array, " k"]
+    problem: ReferenceProblem,
+    known: Float[Array, " readings"],
+    weight: Float[Array, " readings"],
+    start: Float[Array, " k"],
 ) -> tuple[Float[Array, " k"], Float[Array, ""], Bool[Array, ""]]:
     """The most probable unknowns, root mean square of what they leave of the frame, and whether the fit converged."""
 
@@ -370,7 +242,10 @@ def _most_probable(
 
 @verb
 def _described(
-    problem: _Problem, known: Float[Array, " readings"], weight: Float[Array, " readings"], x: Float[Array, " k"]
+    problem: ReferenceProblem,
+    known: Float[Array, " readings"],
+    weight: Float[Array, " readings"],
+    x: Float[Array, " k"],
 ) -> tuple[ReferenceFit, Float[Array, " readings"]]:
     """The fit at the most probable unknowns, and the frame as it explains it."""
     readings, slopes = problem.read(x), weight[:, None] * jax.jacfwd(problem.read)(x)
@@ -390,12 +265,12 @@ def _described(
         contact=jnp.where(touching, 1 / jnp.where(touching, model.contact, 1), 0),
         common_mode=sum((effect.gain for effect in chosen(model.effects, CommonMode)), jnp.zeros_like(parts.level)),
     )
-    error = _parts(jnp.sqrt(jnp.diagonal(covariance)), model.electrodes, problem.channels)
+    error = split_unknowns(jnp.sqrt(jnp.diagonal(covariance)), model.electrodes, problem.channels)
     fit = ReferenceFit(value, error, covariance, information, directions, _rms(missed), model, problem.channel)
     return fit, readings
 
 
-def _missed_by_mesh(problem: _Problem, model: Model) -> Float[Array, " n"]:
+def _missed_by_mesh(problem: ReferenceProblem, model: Model) -> Float[Array, " n"]:
     """Error of the unknowns by the mesh: of the logarithm of contacts on the rim, at most what was believed before."""
     system, believed = model.system, jnp.sqrt(jnp.sum(problem.spread**2, 1))
     on_rim = ~jnp.any(system.contact_mass[:, -1], 1)  # of a piece on the rim: padding, without mass
