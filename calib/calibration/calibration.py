@@ -23,7 +23,8 @@ from ..fitting.pads import PadModel
 from ..presses.crosstalk import Crosstalk
 from ..presses.table import Processing
 from ..session import SessionError, read_archive, write_archive
-from .archives.storage import fields_from_archive, recorded_processing, recorded_recipe, to_archive
+from .archives.provenance import recorded_processing, recorded_recipe
+from .archives.storage import fields_from_archive, to_archive
 from .evaluation import Evaluation
 from .hysteresis_loops import Loops
 from .localisation.electrode_places import PlacedElectrodes

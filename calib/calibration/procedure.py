@@ -29,7 +29,7 @@ from ..presses.skins import differing_parts
 from ..presses.table import PressMeasurements, Processing, measure
 from ..session import Session, SessionError
 from ..session.given import require_session, require_skin_or_none, sessions_of
-from .archives.storage import describe
+from .archives.provenance import describe
 from .calibration import Calibration
 from .evaluation import Evaluation, centre_of
 from .fitted_sessions import FITTED_NOTE, holds_presses, is_fitted, require_each_once

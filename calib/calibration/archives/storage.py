@@ -2,24 +2,22 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxeit as je
-from jaxeit.toml import TomlTable, parse_toml
 
-from ...fitting.cross_validation.selection import Candidate, ModelChoice
+from ...fitting.cross_validation.selection import Candidate
 from ...fitting.curves import CURVES, AbstractCurve, FittedCurve, Linear
 from ...fitting.fields import FIELDS, AbstractField, FittedField, Geometry
 from ...fitting.fields.base import restore_field
 from ...fitting.intervals import NoiseLaw
 from ...presses.crosstalk import Crosstalk
-from ...presses.table import Processing
 from ...session import Archive
 from ..evaluation import Evaluation
 from ..hysteresis_loops import Loops
@@ -29,14 +27,12 @@ from ..localisation.learned.layer_arrays import layer_arrays, layer_from
 from ..localisation.locators import AbstractLocator, locator_from_numbers, locator_numbers
 from ..press_examples import PressExamples
 from ..recalibration.changes import Recalibration
-from ..recipes.recipe import Recipe
-from ..recipes.text import read_imaging, read_processing
 from .arrays import shaped
+from .provenance import recorded_imaging
 
 if TYPE_CHECKING:
     from ..calibration import Calibration
 
-T = TypeVar("T")
 Described = dict[str, tuple[Any, str, str]]  # arrays by name: values, unit and meaning
 
 
@@ -151,41 +147,6 @@ def _require_sealed(archive: Archive) -> None:
         raise ValueError("they were changed after the calibration was saved")
 
 
-def describe(recipe: Recipe, recon: je.imaging.AbstractReconstructor, choice: ModelChoice) -> dict[str, str]:
-    """Provenance of a calibration: its recipe, and the choices that were made by cross-validation."""
-    return {
-        "curve": CURVES.name_of(choice.curve),
-        "location": "none" if choice.field is None else FIELDS.name_of(choice.field),
-        "choice": choice.why,
-        "pixels": "x".join(map(str, recon.shape[::-1])),
-        "hyperparameter": recon.provenance["hyperparameter"],
-        "image_rank": recon.provenance["rank"],
-        "recipe": recipe.to_toml(),
-    }
-
-
-def recorded_recipe(provenance: Mapping[str, str]) -> Recipe | None:
-    """The recipe that `describe` recorded; None for a file of an early version."""
-    text = provenance.get("recipe")
-    return None if text is None else Recipe.from_toml(text, "calibration: recipe")
-
-
-def recorded_processing(provenance: Mapping[str, str]) -> Processing:
-    """How the sessions were cut and corrected; the default for a file of an early version."""
-    return _part(provenance, "processing", lambda table: read_processing(table, Processing()), Processing())
-
-
-def _imaging(provenance: Mapping[str, str]) -> je.Imaging | None:
-    return _part(provenance, "imaging", lambda table: read_imaging(table, je.Imaging()), None)
-
-
-def _part(provenance: Mapping[str, str], key: str, read: Callable[[TomlTable], T], otherwise: T) -> T:
-    """Read one table of the recorded recipe alone, because other tables may name classes that are not installed."""
-    if "recipe" not in provenance:
-        return otherwise
-    return parse_toml(provenance["recipe"], "calibration: recipe", lambda table: read(table.table(key)))
-
-
 def field_arrays(found: FittedField) -> Described:
     """The arrays of a field of gain, by name: values, unit and meaning."""
     choice = {f"choice-{f.name}": getattr(found.field, f.name) for f in fields(found.field)}
@@ -264,7 +225,7 @@ def _recon_from(archive: Archive, provenance: Mapping[str, str]) -> je.imaging.A
     attrs = archive.attrs
     numbers = {k.removeprefix("image/"): v for k, v in archive.arrays.items() if k.startswith("image/")}
     shape = int(attrs["image_rows"]), int(attrs["image_columns"])
-    imaging = _imaging(provenance) if "jacobian" in numbers else None
+    imaging = recorded_imaging(provenance) if "jacobian" in numbers else None
     return je.imaging.from_numbers(numbers, shape, tuple(map(float, numbers["extent"])), None, imaging)
 
 
