@@ -137,7 +137,7 @@ class GeneralisedCrossValidation(AbstractFrameChoice):
         tried, filters = spectrum.filters()
         residual = _residuals(spectrum, filters, self.whitened(whiten))
         m = len(spectrum.squares)
-        freedom = m - jnp.sum(spectrum.squares * filters, 1)
+        freedom = m - jnp.sum(spectrum.squares * filters, 1)  # J Q has the eigenvalues w / (w + l^2)
         return _within("cross-validation", tried, int(jnp.argmin(m * residual / freedom**2)))
 
 
@@ -149,6 +149,7 @@ class LCurve(AbstractFrameChoice):
     def choose(self, spectrum: Spectrum, whiten: Whiten) -> float:
         tried, filters = spectrum.filters()
         y = self.whitened(whiten)
+        # x^T R x but for a constant factor, which moves the curve and leaves its curvature as it is.
         size = jnp.einsum("hk,...k->h", spectrum.squares * filters**2, (y @ spectrum.vectors) ** 2)
         x, z = (np.log(np.asarray(v)) for v in (_residuals(spectrum, filters, y), size))
         (x1, z1), (x2, z2) = _slopes(x, z), _slopes(*_slopes(x, z))

@@ -144,6 +144,7 @@ class _LevelPosterior(AbstractPosterior):
         return x[-2:][self.owner] * jax.nn.sigmoid(x[:-2] / self.width)
 
     def residual(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        # The prior as one number whose half square is the prior plus 1/2: its root alone has no slope at zero.
         return jnp.append(self.image.residual(self.pieces(x)), jnp.sqrt(1 + 2 * self._prior(x)[0]))
 
     def quadratic(self, x: Float[Array, " n"]) -> HalfSquares:

@@ -124,6 +124,8 @@ class Covariance(AbstractPrecision):
         diagonal: Array = jnp.diagonal(self.values)
         return diagonal
 
+    # With L L^T the covariance, Gamma is L^-1, so that its inverse needs no solve.
+
     def seen(self, j: Float[Array, "k basis"]) -> Float[Array, "k basis"]:
         return j @ cholesky(self.values, lower=True)
 

@@ -205,6 +205,7 @@ class InteriorPoint(optx.AbstractMinimiser[Parameters, Any, Parameters]):
         """A Newton step towards a tenth of the gap, as far as x and z stay above zero."""
         x, z = y, state
         target = CENTERING * jnp.mean(x * z)
+        # The step of z is eliminated: z + dz = (target - z dx) / x.
         right = args.linear - args.hessian @ x + target / x
         dx = cho_solve(cho_factor(args.hessian + jnp.diag(z / x)), right)
         dz = (target - z * dx) / x - z

@@ -169,6 +169,7 @@ def qr(a: Float[Array, "m n"]) -> tuple[Float[Array, "m n"], Float[Array, "n n"]
 
 
 def _linear(product: Linear, solve: Linear, transposed: Linear, b: Float[ArrayLike, "n ..."]) -> Float[Array, "n ..."]:
+    # The rule of linear solves: derivatives are further solves, and none goes through the factorisation.
     b = jnp.asarray(b)
     many = b if b.ndim == 2 else b[:, None]
     found: Array = lax.custom_linear_solve(product, many, lambda _, b: solve(b), lambda _, b: transposed(b))
@@ -187,6 +188,7 @@ def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     lower = _lower(*primals)
     half = solve_triangular(lower, tangents[0], lower=True)
     whole = solve_triangular(lower, half.T, lower=True).T
+    # L^-1 dA L^-T is the sum of L^-1 dL, a lower triangle, and its transpose.
     return lower, lower @ (jnp.tril(whole) / (1 + jnp.eye(len(lower), dtype=lower.dtype)))
 
 
@@ -200,6 +202,7 @@ def _eigh(a: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n
 @full_precision
 def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     left, vectors = _eigh(*primals)
+    # First order of perturbation: vectors turn towards each other, without bound where their eigenvalues are equal.
     turned = vectors.T @ tangents[0] @ vectors
     return (left, vectors), (jnp.diagonal(turned), vectors @ (_one_over(left - left[:, None]) * turned))
 
@@ -235,6 +238,7 @@ def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple[Array, Array
     q, r = _qr(*primals)
     change = solve_triangular(r, tangents[0].T, trans=1).T  # da R^-1
     inside = q.T @ change
+    # Q^T dQ is skew, and dR R^-1 an upper triangle: below the diagonal their sum is the former alone.
     below = jnp.tril(inside, -1)
     turn = below - below.T
     return (q, r), (change + q @ (turn - inside), (inside - turn) @ r)

@@ -79,10 +79,13 @@ def _smooth_step(state: State, step: Transition, next_filtered: State, next_smoo
     scale = np.sqrt(np.diag(predicted))
     root = np.linalg.cholesky(predicted / np.outer(scale, scale))
     whitened = np.linalg.solve(root, np.linalg.solve(root, next_filtered.covariance / np.outer(scale, scale)).T)
+    # A frame only takes uncertainty away. Where there is more than was predicted, the tracker has let the contact jump,
+    # and later frames tell nothing of where it was before.
     if np.linalg.eigvalsh(0.5 * (whitened + whitened.T))[-1] > JUMP_RATIO:
         return state
     gain = np.linalg.solve(predicted / np.outer(scale, scale), (matrix @ state.covariance) / scale[:, None]).T / scale
     reduction = np.eye(CONTACT_SIZE) - gain @ matrix
+    # Joseph's form: a sum of positive parts, where P - G (P_predicted - P_smoothed) G^T would cancel.
     covariance = reduction @ state.covariance @ reduction.T + gain @ (walk + next_smoothed.covariance) @ gain.T
     return State(state.mean + gain @ (next_smoothed.mean - matrix @ state.mean), 0.5 * (covariance + covariance.T))
 

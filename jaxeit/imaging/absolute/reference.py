@@ -253,6 +253,7 @@ def _described(
     information, axes = eigh(slopes.T @ slopes)
     information = jnp.maximum(information, 0)  # rounding
     directions = (problem.spread @ axes).T
+    # Along each direction the prior has the variance one, and the frame adds its information to that of the prior.
     covariance = directions.T @ (directions / (1 + information)[:, None])
     parts = problem.parts(x)
     model = problem.there(parts)

@@ -103,6 +103,7 @@ def _alike(touching: np.ndarray, together: float, each: float) -> np.ndarray:
     ones, count = touching.astype(float)[:, None], max(1, int(touching.sum()))
     if not each:
         return together * ones
+    # (each I + m 1 1^T)^2 = each^2 I + (2 each m + count m^2) 1 1^T, solved for m.
     more = (np.hypot(each, np.sqrt(count) * together) - each) / count
     root: np.ndarray = each * np.diag(ones[:, 0]) + more * ones @ ones.T
     return root

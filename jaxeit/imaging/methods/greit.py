@@ -38,4 +38,5 @@ class Greit(AbstractLinearMethod):
         mass, whole = areas @ contacts, areas @ disc
         desired = disc * jnp.where(whole > 0, mass / jnp.where(whole > 0, whole, 1), 0)
         trained = problem.jacobian @ contacts
+        # Y^T (Y Y^T + l^2)^-1 y is the z of least |Y z - y|^2 + l^2 |z|^2.
         return desired @ damped_solution(trained, problem.level(trained), y)[0]

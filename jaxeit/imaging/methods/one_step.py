@@ -27,6 +27,7 @@ class OneStep(AbstractLinearMethod):
         q, r = _stacked_factor(b, level)
         if k > n:
             return jnp.sum(precision.image(solve_triangular(r, jnp.eye(n, dtype=b.dtype))) ** 2, 1)
+        # Woodbury: with Q_n the rows of Q that are those of b^T, b^T (b b^T + l^2)^-1 b is Q_n Q_n^T.
         return (precision.variance() - jnp.sum(precision.image(q[:n]) ** 2, 1)) / level**2
 
 
@@ -63,7 +64,7 @@ def _by_normal_equations(
         z = cho_solve(cho_factor(b.T @ b + level**2 * eye), b.T @ y)
         return z, y - b @ z
     solved = cho_solve(cho_factor(b @ b.T + level**2 * eye), y)
-    return b.T @ solved, level**2 * solved
+    return b.T @ solved, level**2 * solved  # y - b z, without a difference of nearly equal numbers
 
 
 def _by_orthogonal_factor(
@@ -75,7 +76,7 @@ def _by_orthogonal_factor(
         z = solve_triangular(r, q[:k].T @ y)
         return z, y - b @ z
     z = q @ solve_triangular(r, y, trans=1)
-    return z[:n], level * z[n:]
+    return z[:n], level * z[n:]  # the lower rows of Q are level R^-1
 
 
 def _stacked_factor(b: Float[Array, "k n"], level: Float[Array, ""]) -> tuple[Array, Array]:

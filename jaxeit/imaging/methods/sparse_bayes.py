@@ -52,6 +52,7 @@ class SparseBayes(AbstractIterativeMethod):
             half = solve_triangular(factor, j, lower=True)
             seen, own = half.T @ solve_triangular(factor, y, lower=True), jnp.sum(half**2, 0)
             left = jnp.sum((y - j @ (g * seen)) ** 2) + s * jnp.sum(g * own)
+            # x_i^2 / q_i, of which one g is cancelled: finite where a variance has become zero.
             return g * seen**2 / jnp.where(own > 0, own, 1), jnp.maximum(left / len(j), least)
 
         g, s = jax.lax.fori_loop(0, self.steps, again, (g, problem.hyperparameter**2 * power))

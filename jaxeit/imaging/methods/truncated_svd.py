@@ -49,6 +49,7 @@ def _(
     mixed = kept[:, None] != kept  # one is kept, the other not: their values differ
     safe = jnp.where(sums > 0, sums, 1)
     plus = jnp.where(sums > 0, (f[:, None] + f) / safe, 0)
+    # The divided difference of 1/s is -1 / (s_i s_j), finite where the values are equal.
     minus = jnp.where(both, -f[:, None] * f, jnp.where(mixed, (f[:, None] - f) / jnp.where(mixed, apart, 1), 0))
     turned, data, slopes = u.T @ db @ v, u.T @ y, db.T @ y
     inside = 0.5 * (minus * (turned + turned.T) + plus * (turned.T - turned)) @ data

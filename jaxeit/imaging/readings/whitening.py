@@ -232,11 +232,14 @@ def structure_of(gram: np.ndarray) -> PairStructure:
     The tolerance is that of the heaviest readings: beside them, what readings of a millionth of their weight add is
     lost to rounding, and noise whose units differ by 1e60 must not make the rest singular.
     """
+    # Of a G of this rank the factor is [A B; 0 0], so that the columns of P left over are those taken times A^-1 B.
     upper, pivots, rank, _ = dpstrf(gram, tol=1e-11 * gram.diagonal().max())
     taken, left = np.split(pivots - 1, [rank])
     mixing, null = np.empty((rank, len(gram))), np.zeros((len(gram), len(left)))
     mixing[:, taken], mixing[:, left] = np.eye(rank), solve_triangular(upper[:rank, :rank], upper[:rank, rank:])
     null[taken], null[left] = -mixing[:, left], np.eye(len(left))
+    # The columns of null span the null space of M. The unit matrix on what is taken is an inverse of M; the least one
+    # has no part in that space.
     unit = np.zeros_like(mixing)
     unit[:, taken] = np.eye(rank)
     return PairStructure(taken, mixing, unit - unit @ null @ np.linalg.solve(null.T @ null, null.T))

@@ -86,6 +86,7 @@ class NestedDissection(AbstractLinearSolver):
     @full_precision
     def columns(self, factor: NestedDissectionFactor) -> Float[Array, "n r"]:
         plan, scale = factor.plan, factor.scale[:, None]
+        # A load on the root, which is eliminated last, changes no front below it: there is nothing to pass up.
         ys = [y * scale[plan.root].T for y in _root_loads(plan, factor.levels[0])]
         x = _backward(factor, [ys, *[None] * (len(plan.levels) - 1)])
         return scale * x[plan.scatter]
@@ -142,6 +143,7 @@ def _root_corner(plan: NestedDissectionPlan, values: Float[Array, " nnz"]) -> Fl
 
 def _corner_of(plan: NestedDissectionPlan, root: Front, scale: Float[Array, " n"]) -> Float[Array, "r r"]:
     """The inverse on the root, from the factor of its front and the scale."""
+    # The root is eliminated last: its front is the Schur complement U^T U, whose inverse is that of the matrix there.
     y = jnp.concatenate(_root_loads(plan, root), 1)[0] * scale[plan.root]
     return y.T @ y
 
@@ -356,6 +358,7 @@ def _backward(
     for level, front, y in zip(factor.plan.levels, factor.levels, ys, strict=True):
         x = _from_parents(level, x)
         for k in reversed(range(len(front))):
+            # x = U^-1 (y - W x_b) as -U^-1 (W x_b - y): without load there is no y to subtract from.
             rest = stacked_product(_transposed(front[k].beside), x)
             _, own = _ascended(front[k].upper, rest if y is None else rest - y[k])
             x = jnp.concatenate([-own, x], 1)

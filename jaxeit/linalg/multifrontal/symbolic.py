@@ -38,7 +38,7 @@ class _Tree:
     """The dissection tree: level and index of the front that owns each unknown."""
 
     def __init__(self, owner: np.ndarray, depth: int) -> None:
-        self.level = np.frexp(owner.astype(float))[1] - 1
+        self.level = np.frexp(owner.astype(float))[1] - 1  # the floor of log2, which np.log2 may round up
         self.index = owner - (1 << self.level)
         self.rank, self.pivots = self._ranked(depth)
 

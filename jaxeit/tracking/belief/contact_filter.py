@@ -84,6 +84,7 @@ def predict(contact_filter: ContactFilter, belief: Belief, seconds: Float[Array,
     rows = belief.covariance.at[:size].set(transitions @ belief.covariance[:size])
     both = rows.at[:, :size].set(rows[:, :size] @ transitions.T)
     covariance = both.at[:size, :size].add(jnp.kron(jnp.eye(count), walk))
+    # The decay with which the level walks by `gain_rate` over short times, and keeps its variance over long ones.
     mean, variance = belief.level
     decay = jnp.exp(-0.5 * contact_filter.gain_rate**2 * seconds / variance)
     decayed = (

@@ -68,6 +68,7 @@ def _initial_change(problem: UpdateProblem) -> Float[Array, " a"]:
     ratio = lapack.cho_solve((root, True), signals @ problem.frame.y)
     growth = jnp.log(jnp.clip(ratio, 1.0, MAX_GROWTH))
     covariance = lapack.cholesky(forces @ forces.T, lower=True)
+    # The least z, which is the most probable one, among those with this growth.
     grown, none = forces.T @ lapack.cho_solve((covariance, True), growth), jnp.zeros_like(problem.factor[0])
 
     def square(z: Float[Array, " a"]) -> Float[Array, ""]:
@@ -177,6 +178,7 @@ def _laplace_update(problem: UpdateProblem, z: Float[Array, " a"], state: LeastS
     root, ratio = lapack.cholesky(normal, lower=True), problem.scale / problem.single_frame_scale
     return Update(
         belief=_posterior(problem, z, root),
+        # The integral over z takes half the log of the determinant of N off: the prior of z is standard normal.
         evidence=-0.5 * square - jnp.sum(jnp.log(jnp.diag(root))),
         misfit=(square - z @ z) * ratio**2,
         correction_square=z @ z,
@@ -190,6 +192,7 @@ def _posterior(problem: UpdateProblem, z: Float[Array, " a"], root: Float[Array,
     """The belief whose active parameters have changed by C z and have the covariance C N^-1 C^T, with N = R R^T."""
     belief = problem.belief
     across = lapack.solve_triangular(problem.factor, belief.covariance[problem.active], lower=True)
+    # The others follow by regression on the active ones: their covariance with these is `across`^T C^T.
     unit = jnp.eye(len(z), dtype=z.dtype)
     learned = unit - lapack.cho_solve((root, True), unit)
     covariance = belief.covariance - across.T @ (learned @ across)
@@ -203,4 +206,5 @@ def _signal_to_noise(normal: Float[Array, "a a"], factor: Float[Array, "a a"], c
     """Signal-to-noise ratio of each contact: length of the readings' slope in its log force, in standard deviations."""
     unit = jnp.eye(len(factor), dtype=factor.dtype)[:, 3 : LOAD_SIZE * count : LOAD_SIZE]
     along = lapack.solve_triangular(factor, unit, lower=True)
+    # N less the identity, which is the prior's part of it.
     return jnp.sqrt(jnp.maximum(jnp.sum(along * (normal @ along - along), 0), 0))
