@@ -30,8 +30,8 @@ import jax
 import jaxeit as je
 
 from ..calibration.archives.opening import load_calibration
+from ..calibration.argument_checks import are_logs
 from ..calibration.calibration import Calibration
-from ..calibration.given import are_logs
 from ..calibration.logs.calibration import LogCalibration
 from ..calibration.procedure import calibrate
 from ..calibration.recipes.recipe import Recipe, recipe_or_default
@@ -39,7 +39,7 @@ from ..report.document import write_report
 from ..report.figures.parts import require_matplotlib
 from ..runtime import settings, take_over
 from ..session import Session, SessionError, open_session
-from ..session.given import paths_of, require_skin_or_none
+from ..session.argument_checks import paths_of, require_skin_or_none
 from .digests import describe, digest
 from .locks import exclusive, lock_of, remove_unfinished
 from .workers import ONE_AT_A_TIME, end_workers, spawned_pool

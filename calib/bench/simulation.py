@@ -16,7 +16,7 @@ import jaxeit as je
 from jaxeit.messages.kinds import require_kind
 
 from ..session import PressTable, SessionFacts, SessionWriter, Status, StreamFacts
-from ..session.given import call_on
+from ..session.argument_checks import call_on
 from ..session.outputs import disk_full_named
 from .bench import Bench, BenchError
 from .motion import BenchMotion

@@ -14,7 +14,7 @@ import numpy as np
 
 import jaxeit as je
 
-from ..fitting.cross_validation.held_out import Split, bootstrap_interval, place_draws
+from ..fitting.cross_validation.held_out import LeaveOutErrors, bootstrap_interval, place_draws
 
 CALIBRATED = "calibrated"
 FORCE_THIRDS = ("small", "middle", "large")
@@ -90,7 +90,7 @@ class Evaluation:
     notes: tuple[str, ...] = ()
     others: Mapping[str, np.ndarray] = field(default_factory=dict)
     recipe: str = ""
-    splits: tuple[Split, ...] = ()
+    splits: tuple[LeaveOutErrors, ...] = ()
 
     @property
     def total_force(self) -> np.ndarray:
@@ -255,7 +255,7 @@ class Evaluation:
             half_width=arrays.get(array + "half_width"),
             others={name: total for name, total in named("force_").items() if name in FORCE_METHODS},
             recipe=str(attrs.get(f"{attribute}recipe", "")),
-            splits=tuple(Split(**split) for split in json.loads(str(attrs.get(f"{attribute}splits", "[]")))),
+            splits=tuple(LeaveOutErrors(**split) for split in json.loads(str(attrs.get(f"{attribute}splits", "[]")))),
             held_out_by=str(attrs[f"{attribute}held_out_by"]),
             notes=tuple(filter(None, str(attrs[f"{attribute}notes"]).split("\n"))),
         )

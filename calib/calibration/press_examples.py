@@ -8,7 +8,7 @@ import numpy as np
 import jaxeit as je
 
 from ..presses.pooled import PooledPresses
-from .localisation.spread import farthest_first
+from .localisation.farthest_points import farthest_first
 
 COUNT = 4
 PROBES = 24  # presses all over the sheet

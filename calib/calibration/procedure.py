@@ -28,12 +28,12 @@ from ..presses.pooled import PooledPresses, pool_presses
 from ..presses.skins import differing_parts
 from ..presses.table import PressMeasurements, Processing, measure
 from ..session import Session, SessionError
-from ..session.given import require_session, require_skin_or_none, sessions_of
+from ..session.argument_checks import require_session, require_skin_or_none, sessions_of
 from .archives.provenance import describe
+from .argument_checks import are_logs, require_calibration, require_no_eit_choices
 from .calibration import Calibration
 from .evaluation import Evaluation, centre_of
 from .fitted_sessions import FITTED_NOTE, holds_presses, is_fitted, require_each_once
-from .given import are_logs, require_calibration, require_no_eit_choices
 from .hysteresis_loops import typical_loops
 from .layer import learn_layer
 from .localisation.electrode_places import PlacedElectrodes, place_electrodes

@@ -10,7 +10,7 @@ import jaxeit as je
 from ..presses.timing.onsets import OnsetDelay
 from ..record.journal.records import EventCode
 from ..session import Session
-from ..session.given import require_session, require_skin_or_none
+from ..session.argument_checks import require_session, require_skin_or_none
 from ..session.units import wrong_quantity
 from .eit.reading_order import OrderCheck
 from .eit.readings import check_eit

@@ -9,7 +9,7 @@ import numpy as np
 import jaxeit as je
 
 from ..presses.pooled import PressData
-from .cross_validation.held_out import Folds, Split, folds_by_place, hold_out_image, leave_groups_out
+from .cross_validation.held_out import Folds, LeaveOutErrors, folds_by_place, hold_out_image, leave_groups_out
 from .cross_validation.neighbourhoods import error_scale, hold_out_scaled
 from .cross_validation.selection import ModelChoice, choose, nested_selection
 from .curves.base import AbstractCurve
@@ -59,7 +59,7 @@ class HeldOutForces(NamedTuple):
     hold_noise: NoiseLaw
     error_scale: float
     others: dict[str, np.ndarray]
-    splits: tuple[Split, ...]
+    splits: tuple[LeaveOutErrors, ...]
 
 
 def fold_presses(

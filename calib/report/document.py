@@ -11,9 +11,9 @@ import numpy as np
 import jaxeit as je
 from jaxeit.messages.kinds import require_kind
 
+from ..calibration.argument_checks import require_calibration
 from ..calibration.calibration import Calibration
 from ..calibration.evaluation import FORCE_METHODS, FORCE_THIRDS, Evaluation, localisation_errors
-from ..calibration.given import require_calibration
 from ..calibration.logs.calibration import LogCalibration
 from ..calibration.logs.evaluation import LogEvaluation
 from ..fitting.cross_validation.selection import Candidate

@@ -24,7 +24,7 @@ from ..meshing.generation import expected_nodes, triangulate
 from ..meshing.triangles import CROWDED, MIN_ANGLE, Mesh
 from ..notebook import MAX_LINES, Drawing, card
 from ..skin.description import Skin
-from ..skin.electrodes.base import touched
+from ..skin.electrodes.base import discrete_electrodes
 from .fidelity import Fidelity, FidelityError, require_dtype
 from .matrix.metal_sheet import Coat, assembled_coat
 from .matrix.system import System, system_arrays, system_of
@@ -152,7 +152,7 @@ def discretise(
     _require_pairs(scene)
     sheet, metal = _spaces(scene, fidelity, None if mesh is None else mesh.check(min_angle))
     values = _model_arrays(skin, sheet.mesh)
-    electrodes = touched(skin.electrodes, sheet, skin.domain, skin.sheet_resistance)
+    electrodes = discrete_electrodes(skin.electrodes, sheet, skin.domain, skin.sheet_resistance)
     unknowns = number_unknowns(sheet, electrodes, ground)
     require("array_bytes", fidelity.dtype.itemsize * unknowns.count * len(electrodes), "model: one field per electrode")
     arrays, pattern = system_arrays(sheet, unknowns, electrodes)

@@ -15,9 +15,9 @@ from ..imaging.inputs import InverseError, require_real
 from ..messages.kinds import require_unmasked
 from .belief.layer import LearnedLayer
 from .belief.state import Pads
-from .looks import has_converged
 from .preparation import MESH_ERROR_RATIO
 from .tracker import Tracker
+from .unexpected_frames import has_converged
 
 
 def fit_model_error(

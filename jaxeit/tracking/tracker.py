@@ -1,7 +1,7 @@
 """Contacts followed from frame to frame: they are born, move, press, lift and die, and keep their numbers.
 
 An ordinary frame is one update of the belief. A frame that is not what the contacts so far lead to expect is looked
-into (`looks`).
+into (`unexpected_frames`).
 """
 
 from dataclasses import replace
@@ -25,7 +25,10 @@ from .belief.layer import GainField, LearnedLayer
 from .belief.programs import Programs
 from .belief.state import CONTACT_SIZE, LOAD_SIZE, Belief, Pads, Update
 from .events import EventHypotheses
-from .looks import (
+from .preparation import prepare_filter
+from .settings import TrackerSettings
+from .tracks import Backlog, Look, Observation, Track, Tracking
+from .unexpected_frames import (
     advance_look,
     apply_update,
     begin_look,
@@ -39,9 +42,6 @@ from .looks import (
     queue_frame,
     remove_contacts,
 )
-from .preparation import prepare_filter
-from .settings import TrackerSettings
-from .tracks import Backlog, Look, Observation, Track, Tracking
 
 # A frame is expected if its misfit is below this many of its standard deviations above its mean, and if the correction
 # of the belief is below this squared Mahalanobis length.

@@ -16,7 +16,7 @@ from calib.calibration.calibration import Calibration
 from calib.calibration.evaluation import Evaluation
 from calib.calibration.hysteresis_loops import Loops
 from calib.calibration.press_examples import PressExamples
-from calib.fitting.cross_validation.held_out import Split
+from calib.fitting.cross_validation.held_out import LeaveOutErrors
 from calib.fitting.cross_validation.selection import Candidate
 from calib.fitting.curves import FittedCurve, Linear
 from calib.fitting.fields import FittedField, PadEdge, geometry_of, log_gain, single_places
@@ -260,7 +260,10 @@ def test_a_calibration_of_before_has_the_rows_it_can_have(calibration, no_pictur
 
 
 def test_what_is_left_out_at_a_time_is_told(calibration, no_pictures, tmp_path):
-    splits = (Split("pad", 4, 144, 0.7, 0.55, 0.85, 0.84), Split("indenter", 1, note="one indenter <only>"))
+    splits = (
+        LeaveOutErrors("pad", 4, 144, 0.7, 0.55, 0.85, 0.84),
+        LeaveOutErrors("indenter", 1, note="one indenter <only>"),
+    )
     found = replace(calibration, evaluation=replace(calibration.evaluation, splits=splits))
     page = page_of(found, tmp_path)
     assert "0.70 (0.55 to 0.85)" in page

@@ -19,8 +19,8 @@ from ...fitting.logs import LogPrediction
 from ...fitting.pad_gains import PadGains
 from ...fitting.pads import PadModel
 from ...session import SessionError
+from ..argument_checks import require_calibration, require_no_eit_choices
 from ..calibration import Calibration, real_rows
-from ..given import require_calibration, require_no_eit_choices
 from ..localisation.locators import AbstractLocator, locate
 from ..logs.calibration import LogCalibration
 

@@ -12,9 +12,9 @@ from ...check.acceptance import accept
 from ...check.placement import placement_note
 from ...presses.table import Processing, resting_levels
 from ...session import ArchiveWriter, Session
-from ...session.given import require_session
+from ...session.argument_checks import require_session
+from ..argument_checks import require_calibration, require_no_eit_choices
 from ..calibration import Calibration
-from ..given import require_calibration, require_no_eit_choices
 from ..localisation.contact_tracks import TRACK_ARRAYS, ContactTracks, NotFollowed, quiet_tracker
 from ..localisation.load_windows import SeenLoads, WindowedFrames, fit_windows
 from ..localisation.proposals import ProposalChoice, chosen_proposal

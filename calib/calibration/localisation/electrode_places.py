@@ -13,7 +13,7 @@ from jaxeit.imaging import InverseError, KnownPresses, fit_electrodes
 from ...check.electrodes import ELECTRODE_FIDELITY, LARGEST_MISFIT
 from ...presses.pooled import PooledPresses
 from ..archives.arrays import shaped
-from .spread import farthest_first
+from .farthest_points import farthest_first
 
 MOST_PRESSES = 16  # more tell little more, and each costs as long
 

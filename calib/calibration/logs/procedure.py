@@ -37,7 +37,7 @@ from ...fitting.results import FitError
 from ...presses.channel_faults import MIN_ARRAY_CHANNELS, faults
 from ...presses.streams import resample
 from ...session import Session, SessionError, Stream, write_archive
-from ...session.given import call_on, require_session, sessions_of
+from ...session.argument_checks import call_on, require_session, sessions_of
 from ..fitted_sessions import FITTED_NOTE, is_fitted, require_each_once
 from ..recipes.recipe import Recipe, recipe_or_default
 from ..recipes.text import AUTO_CURVES, SWITCHES

@@ -12,10 +12,10 @@ from jaxeit.messages.kinds import require_kind
 from ...fitting.curves.fitted import predict_pads
 from ...fitting.gain_update import GainDrift, GainUpdate
 from ...session import Session, SessionError
-from ...session.given import require_session
+from ...session.argument_checks import require_session
+from ..argument_checks import require_calibration
 from ..calibration import Calibration
 from ..fitted_sessions import SAME_NOTE, holds_presses, is_fitted, require_not_moved_by
-from ..given import require_calibration
 from ..logs.calibration import LogCalibration
 from ..logs.recalibration import recalibrate_log
 from .changes import Evidence, Recalibration

@@ -16,7 +16,7 @@ from numpy.typing import DTypeLike
 import jaxeit as je
 
 from ...calibration import Calibration, LogCalibration
-from ...calibration.given import require_calibration
+from ...calibration.argument_checks import require_calibration
 from ...session import replacing
 from ..errors import ExportError
 from .fields import LocationInC

@@ -13,8 +13,8 @@ from jaxeit.notebook import png_of
 from ...calibration.application.frame_blocks import Progress
 from ...calibration.application.map_files import FORCE_MAP_FORMAT
 from ...session import ArchiveReader, open_archive
+from ...session.argument_checks import paths_of
 from ...session.errors import problem
-from ...session.given import paths_of
 from ...session.outputs import folder_beside
 from ..errors import ExportError
 from .files import DEFAULT_FEATURES, FrameFiles, info_of, write_metadata

@@ -29,7 +29,7 @@ from .scores import assign_folds
 BOOTSTRAP_DRAWS = 2000  # with these the ends of a 90 % range vary by about 2 % of its length
 
 
-class Split(NamedTuple):
+class LeaveOutErrors(NamedTuple):
     """Errors of the total force over the holds, each part predicted by a fit to the others.
 
     | meaning                                                             | unit |
@@ -218,8 +218,8 @@ def leave_groups_out(
     presses: LocatedPresses,
     loss: AbstractLoss,
     groups: Mapping[str, np.ndarray],
-) -> tuple[Split, ...]:
-    """A `Split` for every grouping of the presses.
+) -> tuple[LeaveOutErrors, ...]:
+    """A `LeaveOutErrors` for every grouping of the presses.
 
     Args:
         groups: number of each press's part, (presses,), for each kind of part; -1: in none, and never left out.
@@ -233,27 +233,29 @@ def leave_groups_out(
     )
 
 
-def _leave_out(by: str, part: np.ndarray, presses: LocatedPresses, fit: Callable[..., PadModel]) -> Split:
+def _leave_out(by: str, part: np.ndarray, presses: LocatedPresses, fit: Callable[..., PadModel]) -> LeaveOutErrors:
     data, parts = presses.data, np.unique(part[part >= 0])
     if len(parts) < 2:
-        return Split(by, len(parts), note=f"the presses are of one {by} only: record presses of another too")
+        return LeaveOutErrors(by, len(parts), note=f"the presses are of one {by} only: record presses of another too")
     error = np.full(len(data.force), np.nan)
     for k in parts:
         held = part == k
         force = predict_holds(fit(use=~held), presses).force
         error[held] = (force.sum(1) - data.force)[held]
     if not np.isfinite(error[part >= 0]).all():
-        return Split(by, len(parts), note=f"without one {by} the rest does not determine the fit: record more presses")
+        return LeaveOutErrors(
+            by, len(parts), note=f"without one {by} the rest does not determine the fit: record more presses"
+        )
     return _errors(by, error, part, data.place)
 
 
-def _errors(by: str, error: np.ndarray, part: np.ndarray, place: np.ndarray) -> Split:
+def _errors(by: str, error: np.ndarray, part: np.ndarray, place: np.ndarray) -> LeaveOutErrors:
     predicted_rows = part >= 0
     square, part = error[predicted_rows] ** 2, part[predicted_rows]
     weight = place_draws(place[predicted_rows])
     draws = np.sqrt(weight @ square / weight.sum(1))
     worst = max(np.sqrt(square[part == k].mean()) for k in np.unique(part))
-    return Split(
+    return LeaveOutErrors(
         by, len(np.unique(part)), len(square), float(np.sqrt(square.mean())), *bootstrap_interval(draws), float(worst)
     )
 

@@ -31,11 +31,11 @@ from .directions import Travel, missing_direction, travel_of, unseen_direction
 from .fit import LogFit, fit_log, time_split
 from .gaussian_process import SmoothChannels
 from .location import MIN_PLACES, LogLocation
+from .log_tracker import LogTracker
 from .model import LogModel, LogPrediction
 from .noise import LogNoise, fit_log_noise
 from .selection import FittedLog, fit_series, ways_of
 from .series import LogSeries, series_of
-from .tracking import LogTracker
 
 __all__ = [
     "COMBINATIONS",

@@ -17,8 +17,8 @@ from .base import AbstractIterativeMethod, AbstractLinearMethod, AbstractMethod,
 from .greit import Greit
 from .non_negative import NonNegative
 from .one_step import OneStep
+from .reweighted import Reweighted
 from .sparse_bayes import SparseBayes
-from .total_variation import Reweighted
 from .truncated_svd import TruncatedSvd
 
 METHODS = Registry(AbstractMethod, "method", "jaxeit.methods")

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, Integer
 
 from ...linalg import AbstractPlan, SparsityPattern
 from ...meshing.elements import Space
-from ...skin.electrodes.base import Touched
+from ...skin.electrodes.base import DiscreteElectrode
 from .unknowns import Unknowns
 
 
@@ -120,7 +120,7 @@ class _Bridges(NamedTuple):
 
 
 def system_arrays(
-    space: Space, unknowns: Unknowns, touched: Sequence[Touched]
+    space: Space, unknowns: Unknowns, touched: Sequence[DiscreteElectrode]
 ) -> tuple[dict[str, Any], SparsityPattern]:
     """The fields of a `System` but for its plan, as NumPy arrays, and the pattern of its matrix."""
     dofs, stiffness = unknowns.index[space.dofs], space.stiffness
@@ -171,7 +171,7 @@ def stiffness_places(system: System) -> list[np.ndarray]:
     return [number.astype(int) - 1 for _, number in tables]
 
 
-def _under_discs(space: Space, touched: Sequence[Touched]) -> dict[str, np.ndarray]:
+def _under_discs(space: Space, touched: Sequence[DiscreteElectrode]) -> dict[str, np.ndarray]:
     """Elements under discs with a closed form, which uses their mean conductivity."""
     areas = [space.mesh.areas[electrode.elements] for electrode in touched]
     owners = [np.full(len(part), number) for number, part in enumerate(areas)]
@@ -182,7 +182,7 @@ def _under_discs(space: Space, touched: Sequence[Touched]) -> dict[str, np.ndarr
     }
 
 
-def _contacts(space: Space, unknowns: Unknowns, touched: Sequence[Touched]) -> _Contacts:
+def _contacts(space: Space, unknowns: Unknowns, touched: Sequence[DiscreteElectrode]) -> _Contacts:
     """All pieces in one array; edges have fewer nodes than triangles and are padded with zeros."""
     width = space.dofs.shape[1]
     dofs, masses, owners = [np.zeros((0, width), int)], [np.zeros((0, width, width))], [np.zeros(0, int)]

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...meshing.elements import Space
-from ...skin.electrodes.base import ElectrodeError, Touched
+from ...skin.electrodes.base import DiscreteElectrode, ElectrodeError
 
 RIM_PENALTY = 10.0
 """Sets the fall of the ground weight with the distance from the middle of the sheet: the resistance to the rest of the
@@ -55,7 +55,7 @@ class Unknowns:
     complete: list[int]
 
 
-def number_unknowns(space: Space, touched: Sequence[Touched], ground: int | None) -> Unknowns:
+def number_unknowns(space: Space, touched: Sequence[DiscreteElectrode], ground: int | None) -> Unknowns:
     """The numbering for a space under these electrodes.
 
     Args:

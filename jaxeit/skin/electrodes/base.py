@@ -122,7 +122,7 @@ ELECTRODES = Registry(AbstractElectrode, "electrode", "jaxeit.electrodes")
 """Electrodes by the names that skin files use as ``kind``."""
 
 
-class Touched(NamedTuple):
+class DiscreteElectrode(NamedTuple):
     """One electrode on a function space.
 
     | meaning                                                      | shape | unit |
@@ -139,9 +139,9 @@ class Touched(NamedTuple):
     contact: float
 
 
-def touched(
+def discrete_electrodes(
     electrodes: Sequence[AbstractElectrode], space: Space, domain: Domain, sheet_resistance: float
-) -> list[Touched]:
+) -> list[DiscreteElectrode]:
     """Each of these electrodes on a function space.
 
     Raises:
@@ -151,7 +151,7 @@ def touched(
     for electrode in electrodes:
         pieces, lumped = electrode.pieces(space, domain), electrode.lumped_radius(space, sheet_resistance)
         under = electrode.elements(space) if lumped else np.zeros(0, int)
-        out.append(Touched(pieces, lumped, under, electrode.contact))
+        out.append(DiscreteElectrode(pieces, lumped, under, electrode.contact))
     return out
 
 

@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _calibrate_together(args: argparse.Namespace) -> int:
-    from ....calibration.given import are_logs
+    from ....calibration.argument_checks import are_logs
     from ....calibration.procedure import calibrate, evaluate
     from ....session import open_session
 

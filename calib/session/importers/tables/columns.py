@@ -10,8 +10,8 @@ from pathlib import Path
 
 from jaxeit.messages.spelling import did_you_mean
 
+from ...argument_checks import paths_of
 from ...errors import SessionError, printable, problem
-from ...given import paths_of
 from ...units import KNOWN_UNITS, UNITS
 from ..limits import MAX_COLUMNS
 

@@ -7,7 +7,7 @@ from jaxeit.messages.kinds import require_kind
 from jaxeit.model import require_dtype
 
 from ..session import Session, SessionError
-from ..session.given import call_on
+from ..session.argument_checks import call_on
 from .calibration import Calibration
 from .logs.calibration import LogCalibration
 

@@ -10,7 +10,8 @@ from jaxeit.tracking.belief.frame_update import MAX_STEPS, PIECE_STEPS
 from jaxeit.tracking.belief.programs import Programs
 from jaxeit.tracking.belief.state import Pads
 from jaxeit.tracking.events import allow_jumps
-from jaxeit.tracking.looks import (
+from jaxeit.tracking.tracks import MAX_PATIENCE, PATIENCE, Observation
+from jaxeit.tracking.unexpected_frames import (
     MAX_WAIT,
     MAX_WAITING,
     advance_look,
@@ -19,7 +20,6 @@ from jaxeit.tracking.looks import (
     needs_recount,
     queue_frame,
 )
-from jaxeit.tracking.tracks import MAX_PATIENCE, PATIENCE, Observation
 
 from .conftest import SECONDS, load
 

@@ -11,7 +11,7 @@ import jaxeit as je
 from calib.bench import BenchError
 from calib.export.errors import ExportError
 from calib.session import SessionError, importers
-from calib.session.given import sessions_of
+from calib.session.argument_checks import sessions_of
 
 
 def test_a_path_in_the_place_of_a_session_is_told_how_to_open_it(calibration):
