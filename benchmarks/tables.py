@@ -115,7 +115,7 @@ def _speed(forward: Row, jacobian: Row) -> Iterator[Row]:
 LEVELS_OF = 3721  # nodes of the mesh whose levels stand on the page
 
 
-def _levels(forward: Row) -> list[Row]:
+def _steps(forward: Row) -> list[Row]:
     """Steps of the solve on one mesh, with the share of each and what it reaches of the machine's limit; then all."""
     rows = [row for row in forward["levels"] if row["nodes"] == LEVELS_OF]
     whole, least = rows[-1]["until_ms"], [row.get("least_ms", 0.0) for row in rows]
@@ -378,7 +378,7 @@ ROWS: dict[str, Callable] = {
     "evaluation": _evaluation,
     "speed": _speed,
     "batches": _batches,
-    "levels": _levels,
+    "steps": _steps,
     "onto": _onto,
     "two_fingers": _two_fingers,
     "gpu_batches": _gpu_batches,
