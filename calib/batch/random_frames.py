@@ -4,10 +4,11 @@ A shard is a function of the card and of its number, computed by one thread: equ
 number of processes. A shard that lies in the folder whole is not made again.
 """
 
+import os
 import pickle
 import shutil
-from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import BrokenExecutor, Executor, as_completed
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import metadata
@@ -22,14 +23,16 @@ from jaxeit.messages.kinds import require_kind
 from ..bench import BenchError, FrameSet
 from ..bench.training.frame_shards import SHARDS, TABLES_EXTRA, Shard
 from ..bench.training.scene_frames import SceneFrames
-from ..bench.training.training_frames import FRAMES_VERSION, card_of, claim_folder
+from ..bench.training.training_frames import CARD, FRAMES_VERSION, card_of, claim_folder
 from ..runtime import settings, take_over
 from ..session import file_hash, replacing
+from ..session.outputs import remove_abandoned
 from ..session.importers.child import library
 from .digests import describe, digest
-from .workers import ONE_AT_A_TIME, spawned_pool
+from .workers import ONE_AT_A_TIME, end_workers, run_tasks, spawned_pool
 
 HASHES = "SHA256SUMS"
+_DIED = "a worker process died, most likely for want of memory; the same command goes on, with fewer --jobs"
 
 
 @dataclass(frozen=True)
@@ -69,13 +72,16 @@ def write_training_frames(
     jobs: int = 1,
     begin: Callable[[int, int], object] = lambda frames, nbytes: None,
     tell: Callable[[int], object] = lambda frames: None,
+    finishing: Callable[[int], object] = lambda running: None,
 ) -> WrittenFrames:
     """Simulate frames of random contacts, with pressures, contacts and true force maps, and write them in shards.
 
     Each shard of 1,024 frames is another skin of the scene: the seeds of all effects are drawn. Effects that the scene
     does not list are not simulated. `calib.open_training_frames` reads the folder; ``card.json`` describes it. Equal
-    sets give equal bytes on the same machine, whatever the number of processes. After an interruption the same call
-    goes on. Call this function below ``if __name__ == "__main__":``, because spawned processes import the main module.
+    sets give equal bytes on the same machine, whatever the number of processes. After a first `KeyboardInterrupt` no
+    other shard begins, and it is raised again when those that are being made are written; a second one ends the
+    processes of the default pool at once. The same call goes on. Call this function below
+    ``if __name__ == "__main__":``, because spawned processes import the main module.
 
     Args:
         frame_set: the scene, the number of frames, and how they are simulated and stored; `calib.bench.FrameSet`.
@@ -85,6 +91,7 @@ def write_training_frames(
         jobs: number of processes of the default pool.
         begin: called before the work with the number of frames to make, and an upper bound of their bytes.
         tell: called with the number of frames of each shard when it is written.
+        finishing: called with the number of shards that are being made, after a `KeyboardInterrupt`.
 
     Raises:
         BenchError: nothing can be simulated so; the folder holds something else; the disk has too little space; a
@@ -110,13 +117,22 @@ def write_training_frames(
     folder, versions = Path(folder), _versions(frame_set.file_format)
     # A folder may get more frames, so that the number of frames is no part of the mark.
     mark = digest(describe(replace(frame_set, frames=1)), str(FRAMES_VERSION), *versions.values())
+    found = folder.exists()
     claim_folder(folder, card_of(frame_set, mark, versions))
     files, rows = SHARDS[frame_set.file_format], frame_set.rows
     left = [n for n in range(frame_set.shards) if not files.is_whole(files.path(folder, n), mark, rows(n))]
     to_make, nbytes = sum(map(rows, left)), frame_set.nbytes(left)
-    _require_space(folder, nbytes)
-    begin(to_make, nbytes)
-    _run(executor, jobs, _tasks(folder, frame_set, mark, left), lambda number: tell(rows(number)))
+    try:
+        _require_space(folder, nbytes)
+        begin(to_make, nbytes)
+        _run(executor, jobs, _tasks(folder, frame_set, mark, left), lambda number: tell(rows(number)), finishing)
+    except Exception:
+        _leave_folder(folder, found)
+        raise
+    except KeyboardInterrupt:
+        for number in left:  # of workers that a second interruption ended
+            remove_abandoned(files.path(folder, number))
+        raise
     return WrittenFrames(folder, frame_set.frames, to_make, _finish_folder(folder, frame_set))
 
 
@@ -126,10 +142,10 @@ def _versions(file_format: str) -> dict[str, str]:
     return found | ({"pyarrow": library("pyarrow", TABLES_EXTRA).__version__} if file_format == "parquet" else {})
 
 
-def _tasks(folder: Path, made: FrameSet, mark: str, numbers: Iterable[int]) -> dict[int, _Task]:
+def _tasks(folder: Path, made: FrameSet, mark: str, numbers: Iterable[int]) -> list[_Task]:
     """The tasks that make the shards of these numbers."""
     choices, chosen = pickle.dumps(made), settings()
-    return {number: _Task(str(folder.absolute()), number, choices, mark, chosen) for number in numbers}
+    return [_Task(str(folder.absolute()), number, choices, mark, chosen) for number in numbers]
 
 
 def _require_space(folder: Path, nbytes: int) -> None:
@@ -141,29 +157,50 @@ def _require_space(folder: Path, nbytes: int) -> None:
         )
 
 
-def _run(executor: Executor | None, jobs: int, tasks: Mapping[int, _Task], tell: Callable[[int], object]) -> None:
+def _leave_folder(folder: Path, found: bool) -> None:
+    """Remove the card of frames of which no shard could be made, and the folder, unless it was found."""
+    if os.listdir(folder) == [CARD]:
+        (folder / CARD).unlink()
+        if not found:
+            folder.rmdir()
+
+
+def _run(
+    executor: Executor | None,
+    jobs: int,
+    tasks: Sequence[_Task],
+    tell: Callable[[int], object],
+    finishing: Callable[[int], object],
+) -> None:
     """Make all shards, by the executor or by a pool of so many processes, which lasts as long as the work."""
     if executor is not None:
-        _run_in(executor, tasks, tell)
+        _run_in(executor, tasks, len(tasks), tell, finishing)
     elif tasks:
         with spawned_pool(min(jobs, len(tasks))) as pool:
-            _run_in(pool, tasks, tell)
+            try:
+                _run_in(pool, tasks, jobs, tell, finishing)
+            except KeyboardInterrupt:
+                end_workers(pool)  # `run_tasks` has awaited those that it is to await
+                raise
 
 
-def _run_in(executor: Executor, tasks: Mapping[int, _Task], tell: Callable[[int], object]) -> None:
-    futures = {}
+def _run_in(
+    executor: Executor,
+    tasks: Sequence[_Task],
+    at_once: int,
+    tell: Callable[[int], object],
+    finishing: Callable[[int], object],
+) -> None:
+    def collect(task: _Task, future: Future[None]) -> None:
+        future.result()
+        tell(task.number)
+
     try:
-        futures = {executor.submit(make_shard, task): number for number, task in tasks.items()}
-        for future in as_completed(futures):
-            future.result()
-            tell(futures[future])
+        left = run_tasks(executor, make_shard, tasks, at_once, collect, finishing)
     except BrokenExecutor as error:
-        raise BenchError(
-            "a worker process died, most likely for want of memory; the same command goes on, with fewer --jobs"
-        ) from error
-    finally:
-        for future in futures:
-            future.cancel()  # after an interruption, the shards that have not begun
+        raise BenchError(_DIED) from error
+    if left:
+        raise BenchError(_DIED)
 
 
 def _finish_folder(folder: Path, made: FrameSet) -> int:

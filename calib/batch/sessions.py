@@ -10,17 +10,8 @@ import contextlib
 import os
 import pickle
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    as_completed,
-    wait,
-)
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -42,7 +33,7 @@ from ..session import Session, SessionError, open_session
 from ..session.argument_checks import paths_of, require_skin_or_none
 from .digests import describe, digest
 from .locks import exclusive, lock_of, remove_unfinished
-from .workers import ONE_AT_A_TIME, end_workers, spawned_pool
+from .workers import ONE_AT_A_TIME, end_workers, run_tasks, spawned_pool
 
 _DIED = "its worker process died, most likely for want of memory; try it alone, or on a machine with more"
 _SESSIONS_PER_WORKER = 16  # then a worker is replaced: each new skin leaves its compiled programs in memory
@@ -253,37 +244,16 @@ def _run(
     note: Callable[[Outcome], None],
     finishing: Callable[[int], object],
 ) -> list[_Task]:
-    """Run all tasks and collect their outcomes; returns the tasks that a broken executor did not do.
+    """Run all tasks and collect their outcomes; returns the tasks that a broken executor did not do."""
+    broken = list(tasks)
 
-    Args:
-        at_once: number of tasks that are submitted and not done. One that is submitted may begin after an interruption.
-    """
-    waiting, broken = deque(tasks), list(tasks)
-    futures: dict[Future[Outcome], _Task] = {}
-
-    def collect(future: Future[Outcome]) -> None:
-        task = futures.pop(future)
+    def collect(task: _Task, future: Future[Outcome]) -> None:
         outcome = _outcome_of(future, task)
         if outcome is not None:
             broken.remove(task)
             note(outcome)
 
-    try:
-        while waiting or futures:
-            with contextlib.suppress(BrokenExecutor):
-                while waiting and len(futures) < at_once:
-                    futures[executor.submit(calibrate_one, waiting[0])] = waiting[0]
-                    waiting.popleft()
-            if not futures:
-                break  # the executor takes no more
-            for future in wait(futures, return_when=FIRST_COMPLETED).done:
-                collect(future)
-    except KeyboardInterrupt:
-        running = [future for future in futures if not future.cancel()]
-        finishing(sum(not future.done() for future in running))
-        for future in as_completed(running):
-            collect(future)
-        raise
+    run_tasks(executor, calibrate_one, tasks, at_once, collect, finishing)
     return broken
 
 

@@ -1,11 +1,25 @@
-"""Set up a worker process before it imports large libraries; this module imports the standard library only."""
+"""Set up worker processes before they import large libraries, and give them tasks; the standard library only."""
 
 import contextlib
 import os
 import signal
 import threading
-from concurrent.futures import ProcessPoolExecutor
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    as_completed,
+    wait,
+)
 from multiprocessing import connection, get_context, parent_process
+from typing import TypeVar
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
 
 ONE_THREAD = {
     "PJRT_NPROC": "1",
@@ -29,6 +43,50 @@ def end_workers(pool: ProcessPoolExecutor) -> None:
     """End the workers at once, whatever they do; the pool is broken then, and shuts down without waiting for them."""
     for worker in list((pool._processes or {}).values()):
         worker.kill()
+
+
+def run_tasks(
+    executor: Executor,
+    call: Callable[[Task], Result],
+    tasks: Sequence[Task],
+    at_once: int,
+    collect: Callable[[Task, Future[Result]], object],
+    finishing: Callable[[int], object],
+) -> Sequence[Task]:
+    """Call for each task; returns the tasks that a broken executor did not take.
+
+    After a first `KeyboardInterrupt` no other task begins, and it is raised again when those that run have ended; a
+    second one is raised at once.
+
+    Args:
+        at_once: number of tasks that are submitted and not done. One that is submitted may begin after an interruption.
+        collect: called with each task and its future, which is done.
+        finishing: called with the number of tasks that still run, after a `KeyboardInterrupt`.
+    """
+    waiting = deque(tasks)
+    futures: dict[Future[Result], Task] = {}
+    try:
+        while waiting or futures:
+            with contextlib.suppress(BrokenExecutor):
+                while waiting and len(futures) < at_once:
+                    futures[executor.submit(call, waiting[0])] = waiting[0]
+                    waiting.popleft()
+            if not futures:
+                break  # the executor takes no more
+            for future in wait(futures, return_when=FIRST_COMPLETED).done:
+                collect(futures.pop(future), future)
+    except KeyboardInterrupt:
+        running = [future for future in futures if not future.cancel()]
+        unfinished = sum(not future.done() for future in running)
+        if unfinished:
+            finishing(unfinished)
+        for future in as_completed(running):
+            collect(futures.pop(future), future)
+        raise
+    finally:
+        for future in futures:
+            future.cancel()  # after an error, the tasks that have not begun
+    return waiting
 
 
 def begin() -> None:

@@ -117,7 +117,7 @@ def replacing(path: Path, *, session: bool = False) -> Iterator[Path]:
         raise problem(path, "file", "is a device or a pipe", "give a file name")
     if not session:
         require_no_session(path)
-    _remove_abandoned(path)
+    remove_abandoned(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.tmp")
     descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
     try:
@@ -133,7 +133,7 @@ def replacing(path: Path, *, session: bool = False) -> Iterator[Path]:
         os.close(descriptor)
 
 
-def _remove_abandoned(path: Path) -> None:
+def remove_abandoned(path: Path) -> None:
     """Remove temporary files of `path` whose processes have ended."""
     own = re.compile(rf"\.{re.escape(path.name)}\.[0-9a-f]{{12}}\.tmp")
     with contextlib.suppress(OSError):  # a folder that may not be listed, or another process removes them too

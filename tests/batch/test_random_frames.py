@@ -1,9 +1,16 @@
 """Frames for training: the same bytes however they are made, and physics that a second computation confirms."""
 
+import contextlib
 import dataclasses
 import json
+import os
 import re
+import signal
+import subprocess
+import sys
+import time
 from concurrent.futures import Executor, Future
+from pathlib import Path
 
 import equinox as eqx
 import h5py
@@ -101,6 +108,111 @@ def frames(folder):
 
 def _bytes(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+class Held(Executor):
+    """Two workers: the first shard is made at once, the others when `finish` is called."""
+
+    def __init__(self):
+        self.given = []
+
+    def submit(self, call, task):
+        future = Future()
+        future.set_running_or_notify_cancel()
+        self.given.append((future, call, task))
+        if len(self.given) == 1:
+            self.finish(0)
+        return future
+
+    def finish(self, number):
+        future, call, task = self.given[number]
+        future.set_result(call(task))
+
+
+@pytest.fixture
+def held(monkeypatch):
+    """A pool whose shards are empty files, the pools whose workers were ended, and the writing of five shards."""
+    pool, ended = Held(), []
+    monkeypatch.setattr(random_frames, "spawned_pool", lambda jobs: pool)
+    monkeypatch.setattr(random_frames, "end_workers", ended.append)
+    monkeypatch.setattr(random_frames, "make_shard", lambda task: Path(task.folder, f"{task.number}").touch())
+    frame_set = FrameSet(calib.load_bench("paper_bench"), 5 * SHARD_FRAMES, fidelity=je.Fidelity.draft())
+
+    told = []
+
+    def tell(frames):
+        told.append(frames)
+        if len(told) == 1:
+            interrupt(frames)
+
+    def write(folder, finishing):
+        calib.write_training_frames(frame_set, folder, jobs=2, tell=tell, finishing=finishing)
+
+    return pool, ended, write
+
+
+def interrupt(number):
+    raise KeyboardInterrupt  # as by Ctrl-C
+
+
+def test_after_an_interruption_shards_that_are_being_made_are_awaited_and_no_other_begins(held, tmp_path):
+    pool, ended, write = held
+    running = []
+
+    def finishing(count):
+        running.append(count)
+        pool.finish(1)
+
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path / "out", finishing)
+    assert running == [1]
+    assert [task.number for _, _, task in pool.given] == [0, 1]
+    assert ended == [pool]
+    assert sorted(os.listdir(tmp_path / "out")) == ["0", "1", "card.json"]
+
+
+def test_a_second_interruption_ends_the_workers_and_leaves_no_unfinished_shard(held, tmp_path):
+    pool, ended, write = held
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / ".shard-000001.h5.0123456789ab.tmp").touch()  # of the worker that is killed
+    with pytest.raises(KeyboardInterrupt):
+        write(out, interrupt)
+    assert ended == [pool]
+    assert sorted(os.listdir(out)) == ["0", "card.json"]
+
+
+@pytest.mark.slow
+def test_ctrl_c_twice_ends_the_command_at_once(scene, tmp_path):
+    """The pool waited for ever for workers that it could no longer tell to end."""
+    out = tmp_path / "out"
+    words = ["simulate", str(scene), "--random-scenes", str(20 * SHARD_FRAMES), "-o", str(out), "--jobs", "2", *WORDS]
+    command = [sys.executable, "-m", "calib.cli", *words]
+    with subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE, text=True) as running:
+        try:
+            assert "frames to write" in running.stderr.readline()
+            time.sleep(3)  # until both workers have a task
+            os.killpg(running.pid, signal.SIGINT)  # as a terminal does
+            assert "finishing 2 shards; Ctrl-C again to stop now" in running.stderr.readline()
+            os.killpg(running.pid, signal.SIGINT)
+            assert running.wait(30) == 130
+            told = running.stderr.read()  # to its end, when no process has it open
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(running.pid, signal.SIGKILL)
+    assert told == f"jaxeit: interrupted; the same command goes on from the shards in {out}\n"
+    assert not [name for name in os.listdir(out) if name.endswith(".tmp")]
+
+
+@pytest.mark.parametrize("found", [False, True])
+def test_a_scene_that_is_refused_leaves_no_card_and_no_folder_of_its_own(found, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(random_frames, "spawned_pool", lambda jobs: Here())
+    out = tmp_path / "out"
+    if found:
+        out.mkdir()
+    assert main(["simulate", "ideal", "--random-scenes", "100", "-o", str(out), *WORDS]) == 2
+    assert "no effect by which pressure changes the sheet" in capsys.readouterr().err
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == (["out"] if found else [])
 
 
 @pytest.mark.slow

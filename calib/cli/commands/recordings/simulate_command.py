@@ -229,12 +229,22 @@ def _simulate_random_scenes(args: argparse.Namespace) -> int:
         begin, tell = stack.enter_context(_frame_bar())
         try:
             written = write_training_frames(
-                frame_set, args.output, executor=executor, jobs=args.jobs or 1, begin=begin, tell=tell
+                frame_set,
+                args.output,
+                executor=executor,
+                jobs=args.jobs or 1,
+                begin=begin,
+                tell=tell,
+                finishing=_say_finishing,
             )
         except KeyboardInterrupt as interrupt:
             return say_interrupted(interrupt, f"the same command goes on from the shards in {args.output}")
     show(f"{args.output}: {_frames_text(written, time.monotonic() - start)}, SIMULATED")
     return 0
+
+
+def _say_finishing(running: int) -> None:
+    say(f"finishing {running} {'shard' if running == 1 else 'shards'}; Ctrl-C again to stop now")
 
 
 @contextmanager
