@@ -13,6 +13,7 @@ from ..session.errors import SessionError, printable
 from .eit.reading_order import transfer_matrix
 from .report import Finding, Severity, counted
 from .session import check_session
+from .skin import DIFFERS
 
 
 class RecordingError(SessionError):
@@ -72,12 +73,11 @@ def accept(
     ignored: list[str] = []
     warnings: list[str] = []
     for session in sessions:
-        findings = [
-            f for f in check_session(session, skin, transfer=transfer).findings if f.where.startswith(tuple(where))
-        ]
+        found = check_session(session, skin, transfer=transfer).findings
+        findings = [f for f in found if f.where.startswith(tuple(where))]
         errors = [f for f in findings if f.severity is Severity.ERROR]
         if errors and not ignore_errors:
-            raise RecordingError(_refusal(session, errors))
+            raise RecordingError(_refusal(session, errors, [f for f in found if f.what.startswith(DIFFERS)]))
         name = printable(session.name)
         ignored += [f"{name}: error ignored: {printable(f'{f.where}: {f.what}', 300)}" for f in errors]
         warned = [f for f in findings if f.severity is Severity.WARNING and f.where.startswith(NOTED_PARTS)]
@@ -90,8 +90,12 @@ def _said(finding: Finding) -> str:
     return printable(f"{finding.where}: {finding.what}; {finding.remedy}", 600)
 
 
-def _refusal(session: Session, errors: Sequence[Finding]) -> str:
-    first, name = errors[0], printable(session.name)
+def _refusal(session: Session, errors: Sequence[Finding], differing: Sequence[Finding]) -> str:
+    """The first error; where the skin of the session differs, this first, and the error as what follows from it."""
+    name, said, command = printable(session.name), _said(errors[0]), "jaxeit check"
+    if differing:
+        why, error = (printable(f"{f.where}: {f.what}", 300) for f in (differing[0], errors[0]))
+        said, command = f"{why}; use a session of that skin. With it, {error}", "jaxeit check --skin"
     others = counted(len(errors) - 1, "more error")
-    more = f" ({others}: jaxeit check)" if others else ""
-    return f"{name}: {_said(first)}{more}; or use the session all the same (--force, ignore_errors=True)"
+    more = f" ({others}: {command})" if others else ""
+    return f"{name}: {said}{more}; or use the session all the same (--force, ignore_errors=True)"

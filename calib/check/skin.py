@@ -21,6 +21,7 @@ MIN_COVER = 0.5  # share of the sheet that pads usually cover
 VOLTAGES = 1e-9, 100.0  # V: least and greatest largest reading that electronics can measure
 MIN_READING = 1e-5  # of the largest reading: less than half a step of a converter of 16 bits
 MAX_EMPTY = 0.25  # share of the readings that may be smaller
+DIFFERS = "the recorded skin differs from"
 EMPTY_REMEDY = "choose other rows for the protocol: drive and sense pairs that lie further apart and overlap"
 MAX_CURRENT = 0.1  # A: EIT drives some milliamperes
 PAD_POINTS = 32  # along each side of the box around a shape, at which shares are counted
@@ -96,7 +97,7 @@ def _differences(text: str, other: str, name: str) -> Iterator[Finding]:
     a, b = (_flat(je.toml.parse_values(part, name)) for part in (text, other))
     keys = sorted(k for k in a.keys() | b.keys() if a.get(k) != b.get(k))
     if keys:
-        what = f"the recorded skin differs from {name} in: {listed(keys)}"
+        what = f"{DIFFERS} {name} in: {listed(keys)}"
         yield Finding(Severity.WARNING, "/device", what, "if the change is intended, give the edited skin its own name")
 
 

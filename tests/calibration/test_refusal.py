@@ -13,7 +13,7 @@ import jaxeit as je
 from calib.batch.sessions import calibrate_many
 from calib.bench import Bench, Timing, simulate
 from calib.calibration.logs import procedure as logs
-from calib.check import RecordingError
+from calib.check import RecordingError, accept
 from calib.cli import main
 from calib.fitting.cross_validation import held_out, selection
 from calib.fitting.logs import selection as log_selection
@@ -110,6 +110,18 @@ def test_evaluate_and_apply_refuse_as_well(calibration, reversed_, folder, tmp_p
         assert main([*command, "--force"]) == 0
         capsys.readouterr()
     assert "reversed order" in read_archive(out, "skin-forcemap").attrs["ignored_errors"]
+
+
+def test_a_session_of_another_skin_is_refused_as_such(skin, sound):
+    """Its wires are in order: they look wrong with a skin whose electrodes have another order."""
+    other = je.skin.parse_skin(skin.toml.replace('order = "snake"', 'order = "rows"'), "other.toml")
+    with open_session(sound) as session:
+        accept([session], skin)
+        with pytest.raises(
+            RecordingError, match=r"/device: the recorded skin differs from .*electrodes\.grid"
+        ) as refused:
+            accept([session], other)
+    assert "use a session of that skin. With it, /streams/eit: " in str(refused.value)
 
 
 def test_apply_does_not_mind_the_force(calibration, honest, folder, tmp_path, capsys):
