@@ -26,8 +26,8 @@ from ..bench.training.scene_frames import SceneFrames
 from ..bench.training.training_frames import CARD, FRAMES_VERSION, card_of, claim_folder
 from ..runtime import settings, take_over
 from ..session import file_hash, replacing
-from ..session.outputs import remove_abandoned
 from ..session.importers.child import library
+from ..session.outputs import remove_abandoned
 from .digests import describe, digest
 from .workers import ONE_AT_A_TIME, end_workers, run_tasks, spawned_pool
 
