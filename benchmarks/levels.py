@@ -14,7 +14,8 @@ import jaxeit as je
 from jaxeit.linalg.base import jacobi_scale
 from jaxeit.linalg.multifrontal.fronts import LevelPlan
 from jaxeit.linalg.multifrontal.nested_dissection import in_subtrees, swept, with_constants
-from jaxeit.model.forward_model import assemble, coefficients
+from jaxeit.model.forward_model import assemble
+from jaxeit.model.sheet_conductivity import coefficients
 
 from .clock import in_turns, limits
 from .comparison import least_ms

@@ -33,7 +33,8 @@ from jaxtyping import Array, Float
 from .contacts import Contacts
 from .model import Model, jacobian
 from .model.bases import AbstractPictured, Picture
-from .model.forward_model import coefficients, fields
+from .model.forward_model import fields
+from .model.sheet_conductivity import coefficients
 from .skin import Skin
 
 try:  # an extra: without it the rest of jaxeit works

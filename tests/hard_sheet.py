@@ -15,7 +15,8 @@ import numpy as np
 
 import jaxeit as je
 from jaxeit.linalg import AbstractLinearSolver
-from jaxeit.model.forward_model import coefficients, transfer
+from jaxeit.model.forward_model import transfer
+from jaxeit.model.sheet_conductivity import coefficients
 
 from .helpers import skin_of
 from .oracles.rational import Piece, transfer_matrix

@@ -16,8 +16,9 @@ from jaxtyping import Array, Float
 
 from ..model.discretisation import Model, discretise
 from ..model.fidelity import Fidelity
-from ..model.forward_model import CoatedSheet, conductivity, forward
+from ..model.forward_model import forward
 from ..model.scene import Scene
+from ..model.sheet_conductivity import CoatedSheet, conductivity
 from .recommendation import Reference
 from .settings import Touch
 from .timing import Program, clocked, compiled

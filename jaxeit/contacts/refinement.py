@@ -15,7 +15,8 @@ from ..imaging.readings.whitening import Whitening
 from ..least_squares import ImplicitStep
 from ..least_squares.searches import normal_inverse
 from ..model.discretisation import Model
-from ..model.forward_model import conductivity, forward
+from ..model.forward_model import forward
+from ..model.sheet_conductivity import conductivity
 from .bump_responses import mean_conductivity, quadrature_points
 from .fit import MAX_STEPS, SOLVER, contact_bounds
 from .preparation import sheet_and_readings

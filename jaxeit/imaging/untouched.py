@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..messages.kinds import stated
 from ..model.discretisation import Model
-from ..model.forward_model import CoatedSheet
+from ..model.sheet_conductivity import CoatedSheet
 from . import absolute  # which is imported on first use, since its solvers take a tenth of a second
 from .inputs import InverseError, as_flags, require_real
 

@@ -37,12 +37,13 @@ from .bases import (
 )
 from .discretisation import Model, discretise, expected_mesh_nodes, make_mesh
 from .fidelity import Fidelity, FidelityError, require_dtype
-from .forward_model import CoatedSheet, DerivativeError, conductivity, forward, load_spread, rounding
+from .forward_model import DerivativeError, forward, rounding
 from .matrix.system import System
 from .motion import Motion, MotionError, electrode_motion, moved, shift_jacobian
 from .pneumatics import pad_response
 from .scene import Scene, SceneError, read_effects
 from .sensitivity import jacobian
+from .sheet_conductivity import CoatedSheet, conductivity, load_spread
 
 __all__ = [
     "BASES",

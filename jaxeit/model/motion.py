@@ -25,9 +25,10 @@ from ..meshing.elements import BY_ORDER, P1, element_slopes
 from ..meshing.rim_nodes import RimNodes
 from ..meshing.triangles import Mesh
 from .discretisation import Model, require_model
-from .forward_model import Coefficients, Fields, coefficients, fields, series_resistance, terminal_matrix, voltages
+from .forward_model import Fields, fields, series_resistance, terminal_matrix, voltages
 from .matrix.stiffness import TableBatch
 from .matrix.system import Entries, System, stiffness_places
+from .sheet_conductivity import Coefficients, coefficients
 
 # Parts of an electrode's radius that the mesh needs around it, so that its triangles are not flattened.
 LEAST_REACH = 1.25

@@ -21,18 +21,8 @@ from ..effects import AbstractTerminalEffect, chosen
 from ..messages.kinds import require_kind
 from .bases import AbstractBasis, BasisMap, Elements
 from .discretisation import Model, require_model
-from .forward_model import (
-    CoatedSheet,
-    Coefficients,
-    Fields,
-    coefficients,
-    energy,
-    fields,
-    series_resistance,
-    series_slopes,
-    terminal_matrix,
-    voltages,
-)
+from .forward_model import Fields, energy, fields, series_resistance, series_slopes, terminal_matrix, voltages
+from .sheet_conductivity import CoatedSheet, Coefficients, coefficients
 
 BATCH_ELEMENTS = 512  # elements in a batch, whose slopes and products fit in a core's cache
 

@@ -25,7 +25,8 @@ from ..contacts.bump_responses import quadrature_rule
 from ..linalg import lapack
 from ..model.bases import Pixels
 from ..model.discretisation import Model
-from ..model.forward_model import coefficients, fields, four_terminal, series_slopes, terminal_matrix, transfer
+from ..model.forward_model import fields, four_terminal, series_slopes, terminal_matrix, transfer
+from ..model.sheet_conductivity import coefficients
 from ..skin.protocol import ProtocolError
 
 RealArray = np.ndarray | Array

@@ -20,10 +20,10 @@ from ..imaging.readings.whitening import whitened_readings
 from ..linalg.base import on_device
 from ..model.bases import Pixels
 from ..model.discretisation import Model, discretise
-from ..model.forward_model import conductivity
 from ..model.gaussian_field import field_modes
 from ..model.scene import Scene
 from ..model.sensitivity import pair_jacobian
+from ..model.sheet_conductivity import conductivity
 from ..skin.description import Skin
 from .belief.apparent_gain import apparent_gain
 from .belief.contact_filter import ContactFilter

@@ -25,8 +25,9 @@ from jaxeit.contacts.loads.pressure import (
     spot,
 )
 from jaxeit.imaging import InverseError
-from jaxeit.model.forward_model import coefficients, transfer
+from jaxeit.model.forward_model import transfer
 from jaxeit.model.gaussian_field import field_modes
+from jaxeit.model.sheet_conductivity import coefficients
 from tests.compiled import compiled
 
 from .touches import GAIN, TOUCHES, frames_of, pair, ring, single, tilted

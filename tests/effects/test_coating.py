@@ -10,7 +10,8 @@ import pytest
 import jaxeit as je
 from jaxeit.linalg import Dense
 from jaxeit.meshing.elements import function_space
-from jaxeit.model.forward_model import coefficients, fields, transfer
+from jaxeit.model.forward_model import fields, transfer
+from jaxeit.model.sheet_conductivity import coefficients
 
 from ..helpers import require_identical, sheet_of, skin_of
 

@@ -8,7 +8,8 @@ import pytest
 
 import jaxeit as je
 from jaxeit import effects as fx
-from jaxeit.model.forward_model import coefficients, transfer
+from jaxeit.model.forward_model import transfer
+from jaxeit.model.sheet_conductivity import coefficients
 
 from ..helpers import square_model
 

@@ -16,7 +16,8 @@ import jaxeit as je
 from calib.presses import find_presses
 from calib.session import SessionFacts, SessionWriter, StreamFacts, open_session
 from calib.session.stream import LARGEST_VALUE
-from jaxeit.model.forward_model import coefficients, transfer
+from jaxeit.model.forward_model import transfer
+from jaxeit.model.sheet_conductivity import coefficients
 
 from ..hard_sheet import MESH, paired, sheet_model
 from ..hard_strip import PLACES as STRIP_PLACES, STRIP, Unchecked, strip_error

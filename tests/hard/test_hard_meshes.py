@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import jaxeit as je
-from jaxeit.model.forward_model import coefficients, transfer
+from jaxeit.model.forward_model import transfer
+from jaxeit.model.sheet_conductivity import coefficients
 
 from ..hard_sheet import MESH, SHEET
 from ..hard_strip import capped, graded, strip_error

@@ -9,7 +9,8 @@ import pytest
 import jaxeit as je
 from jaxeit.linalg import Dense
 from jaxeit.meshing.outlines import DiscFootprint, polygon_radius
-from jaxeit.model.forward_model import coefficients, transfer
+from jaxeit.model.forward_model import transfer
+from jaxeit.model.sheet_conductivity import coefficients
 
 from ..helpers import skin_of
 from ..oracles.disc import disc_potentials

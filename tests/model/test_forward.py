@@ -10,7 +10,8 @@ import pytest
 
 import jaxeit as je
 from jaxeit.linalg import Dense
-from jaxeit.model.forward_model import coefficients, transfer
+from jaxeit.model.forward_model import transfer
+from jaxeit.model.sheet_conductivity import coefficients
 
 from ..helpers import skin_of, square_model
 from ..oracles.disc import disc_resistance

@@ -8,7 +8,8 @@ import pytest
 
 import jaxeit as je
 from jaxeit.model.bases import BasisError
-from jaxeit.model.forward_model import coefficients, fields
+from jaxeit.model.forward_model import fields
+from jaxeit.model.sheet_conductivity import coefficients
 
 from ..helpers import square_model
 

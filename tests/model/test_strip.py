@@ -9,7 +9,8 @@ import pytest
 
 import jaxeit as je
 from jaxeit.linalg import Dense
-from jaxeit.model.forward_model import coefficients, transfer
+from jaxeit.model.forward_model import transfer
+from jaxeit.model.sheet_conductivity import coefficients
 
 from ..helpers import skin_of
 from ..oracles.strip import Patch, between_ends, between_two_patches, reading

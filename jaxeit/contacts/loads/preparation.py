@@ -14,8 +14,9 @@ from ..._compile import full_precision, verb
 from ...imaging.inputs import InverseError
 from ...messages.kinds import require_kind
 from ...model.discretisation import Model
-from ...model.forward_model import coefficients, conductivity, transfer
+from ...model.forward_model import transfer
 from ...model.gaussian_field import field_modes
+from ...model.sheet_conductivity import coefficients, conductivity
 from ..bump_responses import mean_conductivity, quadrature_points
 from ..preparation import MIN_SIGNAL, require_signal, sheet_and_readings
 from .belief import LoadBelief

@@ -18,8 +18,9 @@ from jaxtyping import Array, Float, Int
 from ...effects.material import ContactPiezoresistance
 from ...linalg import lapack
 from ...model.discretisation import Model
-from ...model.forward_model import coefficients, fields, series_resistance, transfer
+from ...model.forward_model import fields, series_resistance, transfer
 from ...model.sensitivity import element_slopes
+from ...model.sheet_conductivity import coefficients
 from .pressure import Forms, Parameters, elongations, pressure, shape_directions, tilt_directions
 
 MAX_MODES = 72  # of the gain, those that change the readings of the loads most; and as many of its texture

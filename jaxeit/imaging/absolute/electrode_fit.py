@@ -28,9 +28,10 @@ from ...least_squares import LeastSquaresState, normal_equations, quadratic
 from ...least_squares.searches import HalfSquares, normal_inverse
 from ...model.bases import BasisMap, Pixels
 from ...model.discretisation import Model
-from ...model.forward_model import coefficients, fields, forward, terminal_matrix, voltages
+from ...model.forward_model import fields, forward, terminal_matrix, voltages
 from ...model.motion import Motion, electrode_motion, field_shift_jacobian, moved
 from ...model.sensitivity import field_jacobian, field_slope, scaled_jacobian
+from ...model.sheet_conductivity import coefficients
 from ...registry import AbstractChoice, limited
 from ...registry.limits import LONGEST
 from ..inputs import InverseError

@@ -25,9 +25,10 @@ from scipy.linalg import eigh
 from ..._compile import require_known, verb
 from ...model.bases import Pixels
 from ...model.discretisation import Model
-from ...model.forward_model import Coefficients, Fields, terminal_matrix, voltages
+from ...model.forward_model import Fields, terminal_matrix, voltages
 from ...model.motion import Motion, electrode_motion, field_shift_jacobian
 from ...model.sensitivity import field_jacobian, solved_fields
+from ...model.sheet_conductivity import Coefficients
 from ..inputs import InverseError, real_numbers
 from .background import (
     COATING_COLUMNS,

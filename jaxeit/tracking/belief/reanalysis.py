@@ -29,7 +29,8 @@ from ..._compile import full_precision, verb
 from ...linalg import lapack
 from ...linalg.base import on_device
 from ...model.discretisation import Model
-from ...model.forward_model import Coefficients, assemble, coefficients, fields
+from ...model.forward_model import assemble, fields
+from ...model.sheet_conductivity import Coefficients, coefficients
 
 
 class Reanalysis(eqx.Module):
