@@ -216,12 +216,13 @@ class Tracker:
             held = tracker.press(frames[0])  # V, a press on the bench
             print(held.tracks, tracker.learned(held).contacts)
         """
-        now = self.start(layer)
-        update = self.press_update(now.belief, self.frame(dv), self.pads(pad_forces, pad_errors))
+        now, pads = self.start(layer), self.pads(pad_forces, pad_errors)
+        update = self.press_update(now.belief, self.frame(dv), pads)
         if not is_finite(update):
             return now
         found = replace(now, belief=update.belief, misfit=float(update.misfit), begun=1)
-        return bound_gain(replace(found, numbers=(1,), edges=(False,), faint=(0,)))
+        found = bound_gain(replace(found, numbers=(1,), edges=(False,), faint=(0,)))
+        return self._with_consider_errors(found, pads)
 
     def press_update(self, before: Belief, frame: Float[np.ndarray, " readings"], pads: Pads) -> Update:
         """The belief after a frame in which one contact presses, from a belief without contacts.

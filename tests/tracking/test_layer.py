@@ -108,6 +108,18 @@ def test_presses_one_by_one_tell_the_gain_too(tracker, frame_of):
 
 
 @pytest.mark.slow
+def test_a_press_states_what_shapes_may_cause(tracker, frame_of):
+    """As contacts that are followed do; what unknown shapes add grows with the square of their moments."""
+    frame, added = frame_of([load(0.08, 0.07, 10.0)]), []
+    for shape in (0.0, 0.1, 0.2):
+        now = with_filter(tracker, shape=shape).press(frame)
+        (track,) = now.tracks
+        added.append(track.covariance - np.asarray(now.belief.covariance)[:2, :2])
+    np.testing.assert_allclose(added[2] - added[0], 4 * (added[1] - added[0]), rtol=0.01, atol=1e-12)
+    assert np.linalg.eigvalsh(added[1] - added[0]).min() > (5e-5) ** 2
+
+
+@pytest.mark.slow
 def test_a_press_between_the_wrong_bolts_is_begun_elsewhere(tracker, frame_of, monkeypatch):
     """The best atom may be 20 mm off; from there the fit ends off the sheet, or with another width."""
     true = np.array([0.15, 0.12])
