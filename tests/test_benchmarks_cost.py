@@ -15,6 +15,7 @@ from benchmarks import (
     bench_calibration,
     bench_contact_law,
     bench_growth,
+    bench_learning,
     bench_loads,
     bench_pipeline,
     bench_protocol,
@@ -367,6 +368,30 @@ def test_smoke_of_the_law_of_contacts():
         first = data[scene][0]  # before anything is learned both ways are one
         assert first["presses"] == first["used"] == 0
         assert (first["gain error"], first["gain covered"]) == (first["law error"], first["law covered"])
+
+
+def test_ranks_of_pulls_are_even_if_their_deviation_is_one():
+    """Pulls that are too small heap in the middle, and those that are too large at the ends."""
+    rng = np.random.default_rng(4200)
+    for scale, low, high in ((1.0, 0.01, 1.0), (0.5, 0.0, 1e-6), (2.0, 0.0, 1e-6)):
+        rows = [{"stated place": scale * rng.normal(size=2)} for _ in range(200)]
+        found = bench_learning.ranked(rows, "stated", "place")
+        shares = [int(share) for share in found["place shares"].split()]
+        assert found["place ranks"] == 400
+        assert low <= found["place p"] <= high
+        assert (shares[0] + shares[-1] > shares[4] + shares[5]) == (scale > 1) or scale == 1
+
+
+@pytest.mark.slow
+def test_smoke_learning():
+    data = bench_learning.main(["--smoke"])
+    for shape in bench_learning.SHAPES:
+        before, after, known, _ = data[shape]
+        assert (before["presses"], after["presses"], known["presses"]) == (0, 2, bench_learning.KNOWN)
+        assert before["mm worse"] == before["force worse"] == before["law used"] == 0
+        assert before["force"] == before["law force"]
+        assert 0 < known["mm"] < before["mm"] < 5
+        assert {row["way"] for row in data[f"{shape} ranks"]} == {"belief", "stated"}
 
 
 @pytest.mark.slow
