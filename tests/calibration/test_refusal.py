@@ -124,6 +124,17 @@ def test_a_session_of_another_skin_is_refused_as_such(skin, sound):
     assert "use a session of that skin. With it, /streams/eit: " in str(refused.value)
 
 
+def test_check_asks_whether_a_session_is_of_the_skin_of_its_calibration(calibration, skin, sound, tmp_path, capsys):
+    """Not by the skin that the session brings, with which nothing is wrong."""
+    other = je.skin.parse_skin(skin.toml.replace('order = "snake"', 'order = "rows"'), "other.toml")
+    replace(calibration, skin=other).save(tmp_path / "other.h5")
+    words = ["check", str(sound), "--calibration"]
+    assert main(["check", str(sound)]) == main([*words, str(sound.parent / "calibration.h5")]) == 0
+    assert "Nothing wrong" in capsys.readouterr().out
+    assert main([*words, str(tmp_path / "other.h5")]) == 2
+    assert "the recorded skin differs from" in capsys.readouterr().out
+
+
 def test_apply_does_not_mind_the_force(calibration, honest, folder, tmp_path, capsys):
     """A force map is made of frames and pressures; a load cell the wrong way round does not touch it."""
     path = str(honest.change("force", -honest.values("force")).write(tmp_path / "s.h5"))

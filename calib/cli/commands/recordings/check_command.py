@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ...arguments import skin_of
 from ...terminal import one_line, progress_bar, say, show
@@ -15,7 +15,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Sessions or skins, and how to print what is found."""
     text = "a session to check, or a skin's TOML file to describe and check"
     parser.add_argument("sessions", nargs="+", metavar="SESSION.h5", help=text)
-    parser.add_argument("--skin", help="a shipped skin or a TOML file; default: the session's own")
+    parser.add_argument(
+        "--skin", help="a shipped skin or a TOML file; default: that of --calibration, or else of the session"
+    )
     text = "also print how far the session is off this calibration, and whether to recalibrate"
     parser.add_argument("--calibration", metavar="CALIBRATION.h5", help=text)
     text = "also tell from the untouched frame whether electrodes sit where the skin's file says; takes up to a minute"
@@ -34,8 +36,9 @@ def run(args: argparse.Namespace) -> int:
     from ....check.report import with_health
     from ....session import SessionError, open_session
 
-    skin, worst = skin_of(args.skin), 0
-    health = _health_by(args.calibration)
+    calibration, worst = _calibration_of(args), 0
+    skin = getattr(calibration, "skin", None) if args.skin is None else skin_of(args.skin)  # that of a log has no skin
+    health = None if calibration is None else _health_by(calibration)
     for path in args.sessions:
         if path.endswith(".toml"):
             if args.json:
@@ -86,14 +89,18 @@ def _described(path: str) -> str:
     )
 
 
-def _health_by(path: str | None) -> "Callable[[Session], str] | None":
-    """How a session's health is told by a calibration; None without one."""
-    if path is None:
+def _calibration_of(args: argparse.Namespace) -> Any:
+    if args.calibration is None:
         return None
-    from ....calibration import LogCalibration, assess, assess_log, load_calibration
-    from ....session import SessionError
+    from ....calibration import load_calibration
 
-    calibration = load_calibration(path)
+    return load_calibration(args.calibration)
+
+
+def _health_by(calibration: Any) -> "Callable[[Session], str]":
+    """How a session's health is told by a calibration."""
+    from ....calibration import LogCalibration, assess, assess_log
+    from ....session import SessionError
 
     def health(session: "Session") -> str:
         try:
