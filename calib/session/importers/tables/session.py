@@ -85,7 +85,7 @@ def import_tables(
     Example:
         streams = (importers.StreamSpec("force", ("load",), "N"),)
         table = importers.FileSpec(Path("bench.csv"), time="time", time_unit="s", streams=streams)
-        about = importers.About(title="a bench of ours", license="CC0-1.0")
+        about = importers.StatedFacts(title="a bench of ours", license="CC0-1.0")
         report = importers.import_tables(importers.CsvFile, [table], "by_hand.h5", about)  # or your own
     """
     require_no_session(Path(output), simulated_too=False, imported_too=False)
