@@ -43,10 +43,14 @@ def set_up() -> None:
     je.reuse_memory()
 
 
-def with_one_blas_thread() -> None:
-    """Start this command anew where BLAS has more threads: it reads their number once, when NumPy is imported."""
-    if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
-        os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+def with_one_blas_thread(**more: str) -> None:
+    """Start this command anew where BLAS has more threads: it reads their number once, when NumPy is imported.
+
+    ``more``: other variables of the environment that are read at imports.
+    """
+    wanted = {"OPENBLAS_NUM_THREADS": "1", **more}
+    if any(os.environ.get(name) != value for name, value in wanted.items()):
+        os.environ |= wanted | {"OMP_NUM_THREADS": "1"}
         os.execv(sys.executable, [sys.executable, "-m", f"benchmarks.{Path(sys.argv[0]).stem}", *sys.argv[1:]])
 
 
