@@ -65,7 +65,8 @@ def bind_many(
         parts = []
         for start in range(0, count, size):
             rows = np.minimum(np.arange(start, start + size), count - 1)  # the last sample fills up the last part
-            some = jax.device_put(jax.tree.map(partial(_rows, rows), rest), split)
+            part = rest if size == count else jax.tree.map(partial(_rows, rows), rest)
+            some = jax.device_put(part, split)
             parts.append(jax.tree.map(np.asarray, program(everywhere, some)))
         joined: T = jax.tree.map(lambda *pieces: jnp.asarray(np.concatenate(pieces)[:count]), *parts)
         return joined
