@@ -104,13 +104,10 @@ def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | N
         for factor in (1.0, 1.1, 1.2):
             print(voltages(factor * model.background).max())  # V
     """
-    leaves, static = eqx.partition(first, eqx.is_array)
-    flat, structure = jax.tree.flatten(leaves)
+    flat, form = taken_apart(first)
     packs, layout = _pack_by_type(flat)
-    flags = tuple(sorted((compiler_options() if options is None else options).items()))
-    others, form = jax.tree.flatten(static)
-    typed = tuple((type(leaf), leaf) for leaf in others)  # 1 is no 1.0
-    key = function, structure, layout, typed, form
+    flags = flags_of(options)
+    key = function, form, layout
     inner = _bound(*key, (), None)  # JAX takes options for whole programs only
     if programs_folder() is None:
         outer = _bound(*key, flags, None)
@@ -119,13 +116,38 @@ def bind(function: Callable[..., T], *first: Any, options: Mapping[str, Any] | N
     return lambda *rest: inner(packs, rest) if is_transformed(rest) else unbound(kept(packs, rest))
 
 
+class Form(NamedTuple):
+    """What remains of bound arguments without their arrays; equal for models that differ in their numbers only."""
+
+    arrays: Any
+    others: Any
+    static: tuple[tuple[type, Any], ...]  # with their types: 1 is no 1.0
+
+    def with_arrays(self, arrays: list[Array]) -> tuple[Any, ...]:
+        """The arguments."""
+        static = jax.tree.unflatten(self.others, [leaf for _, leaf in self.static])
+        found: tuple[Any, ...] = eqx.combine(jax.tree.unflatten(self.arrays, arrays), static)
+        return found
+
+
+def taken_apart(first: tuple[Any, ...]) -> tuple[list[Array], Form]:
+    """The arrays of bound arguments, and the rest."""
+    leaves, rest = eqx.partition(first, eqx.is_array)
+    flat, arrays = jax.tree.flatten(leaves)
+    static, others = jax.tree.flatten(rest)
+    return flat, Form(arrays, others, tuple((type(leaf), leaf) for leaf in static))
+
+
+def flags_of(options: Mapping[str, Any] | None) -> tuple[tuple[str, Any], ...]:
+    """Options for XLA as a key; by default `compiler_options`."""
+    return tuple(sorted((compiler_options() if options is None else options).items()))
+
+
 @lru_cache(maxsize=256)
 def _bound(
     function: Callable[..., T],
-    structure: Any,
+    form: "Form",
     layout: "_Layout",
-    typed: tuple[Any, ...],
-    form: Any,
     flags: Any,
     changes: int | None,
 ) -> Callable[..., T]:
@@ -139,11 +161,7 @@ def _bound(
 
     @partial(jax.jit, compiler_options=dict(flags))
     def program(packs: list[Array], rest: tuple[Any, ...]) -> T:
-        leaves, static = (
-            jax.tree.unflatten(structure, layout.unpack(packs)),
-            jax.tree.unflatten(form, [leaf for _, leaf in typed]),
-        )
-        found: T = run(*eqx.combine(leaves, static), *rest)
+        found: T = run(*form.with_arrays(layout.unpack(packs)), *rest)
         return found
 
     compiled: Callable[..., T] = program

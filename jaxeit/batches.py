@@ -4,13 +4,13 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from typing import Any, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec as P
+from jaxtyping import Array
 
-from ._compile import compiler_options, full_precision, is_transformed
+from ._compile import Form, flags_of, full_precision, is_transformed, taken_apart
 
 T = TypeVar("T")
 
@@ -48,12 +48,9 @@ def bind_many(
     if together < 1:
         raise ValueError(f"bind_many: together is {together}; give the number of samples that a device takes at a time")
     mesh = Mesh(np.array(jax.local_devices()), ("samples",))
-    leaves, static = eqx.partition(first, eqx.is_array)
-    others, form = jax.tree.flatten(static)
-    flags = tuple(sorted((compiler_options() if options is None else options).items()))
-    typed = tuple((type(leaf), leaf) for leaf in others)  # 1 is no 1.0
-    program = _program(function, jax.tree.structure(leaves), typed, form, flags, mesh)
-    everywhere = jax.device_put(leaves, NamedSharding(mesh, P()))
+    arrays, form = taken_apart(first)
+    program = _program(function, form, flags_of(options), mesh)
+    everywhere = jax.device_put(arrays, NamedSharding(mesh, P()))
     split = NamedSharding(mesh, P("samples"))
 
     def many(*rest: Any) -> T:
@@ -90,13 +87,12 @@ def _rows(rows: np.ndarray, array: Any) -> Any:
 
 @lru_cache(maxsize=64)
 def _program(
-    function: Callable[..., T], structure: Any, typed: tuple[Any, ...], form: Any, flags: Any, mesh: Mesh
+    function: Callable[..., T], form: Form, flags: tuple[tuple[str, Any], ...], mesh: Mesh
 ) -> Callable[..., T]:
     """The program of `bind_many`, which models that differ in their numbers only share."""
 
-    def share(leaves: Any, samples: tuple[Any, ...]) -> T:
-        first = eqx.combine(leaves, jax.tree.unflatten(form, [leaf for _, leaf in typed]))
-        found: T = jax.vmap(partial(full_precision(function), *first))(*samples)
+    def share(arrays: list[Array], samples: tuple[Any, ...]) -> T:
+        found: T = jax.vmap(partial(full_precision(function), *form.with_arrays(arrays)))(*samples)
         return found
 
     # Without the check of replication, because loops in the solver start from constants, which the check takes for
