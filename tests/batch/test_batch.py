@@ -25,6 +25,7 @@ from calib.cli import main
 from calib.runtime import settings, take_over
 
 from ..batch_worker import deadly_pool
+from .held_pool import Held
 
 
 class Here(Executor):
@@ -283,28 +284,8 @@ def test_a_session_that_kills_its_worker_is_named_and_the_rest_complete(made, bu
 # --- interruptions -------------------------------------------------------------------------------
 
 
-class Running(Here):
-    """A pool of two workers that do what they are given when they are told to, and never stop."""
-
-    def __init__(self):
-        super().__init__()
-        self.given = []
-
-    def submit(self, call, task):
-        future = Future()
-        future.set_running_or_notify_cancel()
-        self.given.append((future, call, task))
-        if len(self.given) == 1:
-            self.finish(0)
-        return future
-
-    def finish(self, number):
-        future, call, task = self.given[number]
-        future.set_result(call(task))
-
-
 def test_after_an_interruption_what_runs_ends_and_nothing_begins(quick, sessions, tmp_path, monkeypatch):
-    pool, ended = Running(), []
+    pool, ended = Held(), []
     monkeypatch.setattr(batch, "spawned_pool", lambda jobs: pool)
     monkeypatch.setattr(batch, "end_workers", ended.append)
     told, running = [], []
@@ -329,7 +310,7 @@ def test_after_an_interruption_what_runs_ends_and_nothing_begins(quick, sessions
 
 
 def test_a_second_interruption_ends_the_workers_and_leaves_nothing_unfinished(quick, sessions, tmp_path, monkeypatch):
-    pool, ended, out = Running(), [], tmp_path / "out"
+    pool, ended, out = Held(), [], tmp_path / "out"
     monkeypatch.setattr(batch, "spawned_pool", lambda jobs: pool)
     monkeypatch.setattr(batch, "end_workers", ended.append)
     told = []
@@ -359,7 +340,7 @@ def locked(path):
 
 
 def test_the_command_says_what_an_interrupted_batch_has_written(quick, sessions, tmp_path, monkeypatch, capsys):
-    pool = Running()
+    pool = Held()
     monkeypatch.setattr(batch, "spawned_pool", lambda jobs: pool)
     monkeypatch.setattr(batch, "end_workers", lambda pool: None)
     real = batch.calibrate_many

@@ -32,6 +32,7 @@ from calib.cli import main
 
 from ..helpers import skin_of
 from ..test_docs import run
+from .held_pool import Held
 
 FRAMES = SHARD_FRAMES + 200
 WORDS = ["--fidelity", "draft", "--pixels", "20", "--seed", "5"]
@@ -108,25 +109,6 @@ def frames(folder):
 
 def _bytes(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
-
-
-class Held(Executor):
-    """Two workers: the first shard is made at once, the others when `finish` is called."""
-
-    def __init__(self):
-        self.given = []
-
-    def submit(self, call, task):
-        future = Future()
-        future.set_running_or_notify_cancel()
-        self.given.append((future, call, task))
-        if len(self.given) == 1:
-            self.finish(0)
-        return future
-
-    def finish(self, number):
-        future, call, task = self.given[number]
-        future.set_result(call(task))
 
 
 @pytest.fixture
