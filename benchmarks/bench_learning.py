@@ -3,10 +3,10 @@
 Flat round tips of 5 to 30 mm, which the tracker does not know, press with 4 to 25 N at random places of a testbed skin
 whose coat and contact layer are drawn anew for each seed, on another mesh than that of the tracker. A press is one
 frame, with noise 60 dB below the readings; the pads tell their forces to 3 % and 0.1 N; the untouched sheet is fitted
-to the mean of 100 frames, and the model error to the first 24 presses, as `calibrate` does. Presses teach one after the
-other, as `learn_layer` has them teach: `Tracker.press`, `Tracker.learned`, and the law of contacts. After each stage
-the layer is frozen and asked about other presses, the same frames at each stage, so that errors are paired. At 0
-presses nothing is taught.
+to the mean of 100 frames, and the depth of the sheet and the model error to the first 24 presses, as `live` does.
+Presses teach one after the other, as `learn_layer` has them teach: `Tracker.press`, `Tracker.learned`, and the law of
+contacts. After each stage the layer is frozen and asked about other presses, the same frames at each stage, so that
+errors are paired. At 0 presses nothing is taught.
 
 Loads: Gaussian, as wide as the tip with a pad that spreads by 8 mm; or of the tip on an elastic half-space, 10 mm deep,
 about as wide with other tails. Pressure changes the sheet by the law that the tracker takes for granted.
@@ -36,7 +36,17 @@ from scipy.stats import chisquare
 
 import jaxeit as je
 from calib.calibration.localisation.learned.law_lessons import updated_law
-from jaxeit.tracking import ContactLaw, LearnedLayer, Tracker, Tracking, fit_model_error, prepare_tracker
+from jaxeit.contacts import LoadSettings
+from jaxeit.tracking import (
+    ContactLaw,
+    LearnedLayer,
+    Tracker,
+    TrackerSettings,
+    Tracking,
+    fit_depth,
+    fit_model_error,
+    prepare_tracker,
+)
 from jaxeit.tracking.belief import PRESS_VARIANCES
 
 from .bench_contact_law import gaussian
@@ -116,6 +126,9 @@ def _half_space(model: je.Model, places: np.ndarray, diameters: np.ndarray) -> n
 
 
 SHAPES = {GAUSSIAN: _gaussians, HALF_SPACE: _half_space}  # pressure of one newton on the elements, Pa
+TAKEN = "half-space taken for Gaussian"
+# Shape of the loads, and whether presses tell how loads spread.
+CASES = {GAUSSIAN: (GAUSSIAN, True), HALF_SPACE: (HALF_SPACE, True), TAKEN: (HALF_SPACE, False)}
 
 
 @eqx.filter_jit
@@ -132,14 +145,29 @@ class Shown(NamedTuple):
 
 
 class Session:
-    """A tracker of a skin, and what it is shown of presses."""
+    """A tracker of a skin, and what it is shown of presses.
 
-    def __init__(self, model: je.Model, skin: Skin, presses: Presses, seed: int, probes: int = PROBES):
+    Args:
+        probes: first presses, which tell how loads spread and how far the model errs; 0: the tracker stays as it is.
+        spread: whether presses tell how loads spread; otherwise they are taken for Gaussian.
+    """
+
+    def __init__(
+        self, model: je.Model, skin: Skin, presses: Presses, seed: int, probes: int = PROBES, spread: bool = True
+    ):
         self.rng, self.std = np.random.default_rng([seed, 37]), presses.found.std
         untouched = presses.found.blank(self.rng)
-        tracker = prepare_tracker(model, skin.skin, noise=self.std, untouched=untouched)
-        shown = [self.shown(presses, number) for number in range(probes)]
-        self.tracker = fit_model_error(tracker, *map(np.array, zip(*shown, strict=True)))
+        self._prepare = partial(prepare_tracker, model, skin.skin, noise=self.std, untouched=untouched)
+        self.tracker, self.depth = self._prepare(), 0.0
+        if probes:
+            shown = [self.shown(presses, number) for number in range(probes)]
+            told = [np.array(part) for part in zip(*shown, strict=True)]
+            self.depth = fit_depth(self.tracker, *told) if spread else 0.0
+            self.tracker = fit_model_error(self.at_depth(self.depth), *told)
+
+    def at_depth(self, depth: float) -> Tracker:
+        """The tracker of a sheet at a depth, m."""
+        return self._prepare(TrackerSettings(loads=LoadSettings(depth=depth))) if depth else self.tracker
 
     def shown(self, presses: Presses, number: int, noise: float = 1.0) -> Shown:
         """A press with so much of the usual noise."""
@@ -208,32 +236,34 @@ def ranked(rows: Sequence[Row], way: str, what: str) -> Row:
     return {f"{what} ranks": len(found), f"{what} shares": shares, f"{what} p": float(chisquare(counts).pvalue)}
 
 
-def one_shape(run: Run, shape: str) -> Iterator[Row]:
+def one_shape(run: Run, case: str) -> Iterator[Row]:
     """Errors and ranks on skins that tips press in one way."""
+    shape, spread = CASES[case]
     seeds, stages, count, probes = run.sizes((SEEDS, STAGES, TESTS, PROBES), (1, (0, 2), 2, 2))
     model, rows = fit_model(), []
     for seed in range(FIRST_SEED, FIRST_SEED + seeds):
         skin = Skin(seed)
         teaching, given = skin.pressed(shape, max(stages)), skin.pressed(shape, count)
-        session = Session(model, skin, teaching, seed, probes)
+        session = Session(model, skin, teaching, seed, probes, spread)
         shown = [session.shown(given, number) for number in range(count)]
         exact = [session.shown(given, number, noise=0.0) for number in range(count)]
 
         def asked(presses: Any, frames: list[Shown], *known: Any, at: Any = (session, given, seed)) -> list[Row]:
             told, tests, own = at
-            about = {"presses": presses, "seed": own}
+            about = {"presses": presses, "seed": own, "depth": told.depth}
             return [about | told.judged(tests, number, one, *known) for number, one in enumerate(frames)]
 
         for number, layer, law in session.taught(teaching, stages):
             rows += [row | {"law": law.is_better} for row in asked(number, shown, layer, law)]
         for name, frames in ((KNOWN, shown), (NOISELESS, exact)):
             rows += [row | {"law": False} for row in asked(name, frames, skin.known(session.tracker))]
-        print(f"{shape}, skin {seed}: {progress([row for row in rows if row['seed'] == seed])}", flush=True)
+        own = progress([row for row in rows if row["seed"] == seed])
+        print(f"{case}, skin {seed}, depth {1e3 * session.depth:.1f} mm: {own}", flush=True)
     after = grouped(rows, "presses")
-    yield {shape: [{"load": shape} | summary(presses, some, after[0]) for presses, some in after.items()]}
+    yield {case: [{"load": case} | summary(presses, some, after[0]) for presses, some in after.items()]}
     yield {
-        f"{shape} ranks": [
-            {"load": shape, "way": way, "presses": presses} | ranked(some, way, "place") | ranked(some, way, "force")
+        f"{case} ranks": [
+            {"load": case, "way": way, "presses": presses} | ranked(some, way, "place") | ranked(some, way, "force")
             for way in ("belief", "stated")
             for presses, some in after.items()
             if presses in (RANKED if not run.smoke else stages)
@@ -261,10 +291,12 @@ def summary(presses: Any, rows: Sequence[Row], before: Sequence[Row]) -> Row:
         found[f"{name} worse"] = sum(bool(means[seed] > first[seed]) for seed in means)
         found[f"{name} worst"] = round(max(float(means[seed] / first[seed]) for seed in means), 3)
         found[f"{name} ratios"] = [round(float(means[seed] / first[seed]), 3) for seed in means]
+    depths = 1e3 * np.array([some[0]["depth"] for some in grouped(rows, "seed").values()])
+    found["depths mm"] = [round(float(depth), 1) for depth in depths]
     return found | {"law used": len({row["seed"] for row in rows if row["law"]})}
 
 
-main = Question("learning", __doc__, {shape.lower(): partial(one_shape, shape=shape) for shape in SHAPES})
+main = Question("learning", __doc__, {case.lower(): partial(one_shape, case=case) for case in CASES})
 
 if __name__ == "__main__":
     with_one_blas_thread()  # small matrices: threads that wait for one another cost ten times as much

@@ -36,6 +36,7 @@ Example:
 from .belief.layer import GainField, LearnedLayer
 from .compilation import compile_tracker
 from .contact_law import ContactLaw
+from .load_depth import fit_depth
 from .model_error import fit_model_error, press_evidence
 from .settings import TrackerSettings
 from .smoothing import Smoother, TimedTracks
@@ -53,6 +54,7 @@ __all__ = [
     "TrackerSettings",
     "Tracking",
     "compile_tracker",
+    "fit_depth",
     "fit_model_error",
     "prepare_tracker",
     "press_evidence",

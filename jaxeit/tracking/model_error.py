@@ -47,7 +47,7 @@ def fit_model_error(
         print(humble.settings.loads.model_error, tracking.press_evidence(humble, presses))
     """
     require_known("fit_model_error", InverseError, dv, pad_forces, pad_errors)
-    observations = _observations(tracker, dv, pad_forces, pad_errors)
+    observations = press_observations(tracker, dv, pad_forces, pad_errors)
     tracker_with = cache(partial(_with_model_error, tracker))  # most presses ask for the first few
 
     def evidence(frame: np.ndarray, pads: Pads, error: float) -> float:
@@ -73,14 +73,19 @@ def press_evidence(
         layer: as for `Tracker.start`.
     """
     require_known("press_evidence", InverseError, dv, pad_forces, pad_errors)
-    observations = _observations(tracker, dv, pad_forces, pad_errors)
+    observations = press_observations(tracker, dv, pad_forces, pad_errors)
     before = tracker.start(layer).belief
     return np.array([float(tracker.press_update(before, frame, pads).evidence) for frame, pads in observations])
 
 
-def _observations(
+def press_observations(
     tracker: Tracker, dv: ArrayLike, pad_forces: ArrayLike | None, pad_errors: ArrayLike | None
 ) -> list[tuple[np.ndarray, Pads]]:
+    """Frames of single presses, with what pads tell of each.
+
+    Raises:
+        InverseError: if there is no frame, or an array has another shape.
+    """
     require_real(dv=dv)
     require_unmasked({"pad_forces": pad_forces, "pad_errors": pad_errors}, InverseError)
     frames = np.asarray(dv, float)

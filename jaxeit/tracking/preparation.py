@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from .._compile import full_precision, verb
 from ..contacts.bump_responses import quadrature_points
+from ..contacts.loads.spreading import Spreading
 from ..contacts.preparation import prepare_contacts
 from ..contacts.settings import ContactSettings
 from ..fusion import pad_masks
@@ -132,6 +133,7 @@ def _loaded_sheet(
         coat=of_coat,
         untouched_slopes=reanalysis.slopes_along(light(mean) * of_coat.T, reanalysis.potential),
         law=loads.law,
+        spreading=Spreading.at_depth(loads.depth or 0.0, settings.dtype),
     )
     return (
         field,

@@ -233,7 +233,7 @@ class Tracker:
         found: list[Update] = []
         for place in self.programs.matched_positions(self.programs.innovation(before, frame, pads)):
             found.append(self.press_programs.single_frame_update(self.events.with_contact(before, place), frame, pads))
-            if has_converged(found[-1]) and not self._is_misfit(found[-1]):
+            if has_converged(found[-1]) and not self.is_misfit(found[-1]):
                 break
         return max(found, key=lambda update: np.nan_to_num(float(update.evidence), nan=-np.inf))
 
@@ -245,7 +245,7 @@ class Tracker:
         if now.backlog is not None:
             predicted, update = self.programs.predict_and_update(now.belief, *observation)
             # An unexplained innovation would bend the contacts: until it is explained they are only predicted.
-            after = replace(now, belief=predicted) if self._is_misfit(update) else apply_update(now, update)
+            after = replace(now, belief=predicted) if self.is_misfit(update) else apply_update(now, update)
             return replace(after, backlog=queue_frame(now.backlog, observation))
         after, look = self._follow(now, observation)
         if look is None:
@@ -347,9 +347,10 @@ class Tracker:
         if float(update.correction_square) >= MAX_CORRECTION_SQUARE:
             return True
         grown = float(update.misfit) > MISFIT_GROWTH * now.misfit
-        return self._is_misfit(update) and (now.since >= now.patience or grown)
+        return self.is_misfit(update) and (now.since >= now.patience or grown)
 
-    def _is_misfit(self, update: Update) -> bool:
+    def is_misfit(self, update: Update) -> bool:
+        """Whether an update leaves more of a frame than noise and the model error would."""
         size = self.programs.size
         return float(update.misfit) > size + MAX_MISFIT_SCORE * float(np.sqrt(2 * size))
 

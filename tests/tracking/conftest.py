@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 import jaxeit as je
+from jaxeit.contacts.loads.spreading import Spreading
 from jaxeit.tracking import Tracker, TrackerSettings, prepare_tracker
 from jaxeit.tracking.belief.response import load_pressure
 
 SECONDS = 0.01
+GAUSSIAN = Spreading.at_depth(0.0, float)
 SETTINGS = TrackerSettings(most=2, unknowns=64, modes=8, pixels=250, columns=40)
 
 
@@ -32,7 +34,7 @@ def frame_of(model, blank):
 
     @jax.jit
     def change(loads, gain):
-        pressure = sum(load_pressure(load, model.centroids) for load in loads)
+        pressure = sum(load_pressure(load, model.centroids, GAUSSIAN) for load in loads)
         return je.forward(model, model.background * (1 + gain * pressure / (20e3 + gain * pressure)))
 
     v0, noise = blank

@@ -16,7 +16,7 @@ from jaxeit.tracking.belief.consider import ConsiderErrors
 from jaxeit.tracking.belief.response import MIN_HALF_LENGTH, load_pressure
 from tests.compiled import compiled
 
-from .conftest import SECONDS, SETTINGS, load
+from .conftest import GAUSSIAN, SECONDS, SETTINGS, load
 
 DRAWS, FRAMES = 12, 20
 SHAPE = 0.1
@@ -43,7 +43,8 @@ def followed(model, tracker, blank):
     @jax.jit
     def readings(one, moments):
         points = model.centroids
-        pressure = jnp.maximum(load_pressure(one, points) + line_shapes(one, points, MIN_HALF_LENGTH) @ moments, 0)
+        round_load = load_pressure(one, points, GAUSSIAN)
+        pressure = jnp.maximum(round_load + line_shapes(one, points, MIN_HALF_LENGTH) @ moments, 0)
         return je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
 
     told = []
@@ -115,7 +116,7 @@ def test_slopes_in_the_coat_are_those_of_the_forward_map(model, even_tracker, co
     gain = jnp.zeros(len(even_tracker.filter.places))
     found = compiled(sheet.coat_slopes, one[None], gain, sheet.neighbourhood(one[None]))
     drawn = coats @ np.random.default_rng(1).normal(size=coats.shape[1])
-    pressure = load_pressure(one, model.centroids)
+    pressure = load_pressure(one, model.centroids, GAUSSIAN)
 
     def change(part):
         sigma = model.background * jnp.exp(part * drawn)
@@ -145,7 +146,7 @@ def on_coats(model, even_tracker, blank, coats):
 
     @jax.jit
     def readings(one, coat):
-        sigma, pressure = model.background * jnp.exp(coat), load_pressure(one, model.centroids)
+        sigma, pressure = model.background * jnp.exp(coat), load_pressure(one, model.centroids, GAUSSIAN)
         return je.forward(model, sigma * (1 + pressure / (20e3 + pressure))) - je.forward(model, sigma)
 
     told = []

@@ -19,7 +19,7 @@ from jaxeit.tracking.belief.response import Neighbourhood, load_pressure
 from jaxeit.tracking.preparation import with_sheet_errors
 from jaxeit.tracking.tracker import MAX_GAIN, bound_gain
 
-from .conftest import SECONDS, load, with_filter, with_settings
+from .conftest import GAUSSIAN, SECONDS, load, with_filter, with_settings
 
 STRONGER = 1.3  # the true gain of the layer, everywhere
 FORCES = np.array([10.0, 0.0, 0.0, 0.0])  # N on the pads under a press at (0.05, 0.06) m
@@ -463,7 +463,7 @@ def test_a_sheet_that_is_wrong_looks_like_gain(model, tracker):
 
     @jax.jit
     def change(one):
-        pressed = true * loads.law.factor(load_pressure(one, model.centroids))
+        pressed = true * loads.law.factor(load_pressure(one, model.centroids, GAUSSIAN))
         return je.forward(model, pressed) - je.forward(model, true)
 
     before = tracker.start(known_variance(0.0, tracker.field))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxeit as je
+from jaxeit.contacts.loads.spreading import Spreading
 from jaxeit.imaging.readings.whitening import whitened_readings
 from jaxeit.model.bases import Elements
 from jaxeit.model.sensitivity import pair_jacobian
@@ -15,7 +16,7 @@ from jaxeit.tracking.belief.response import load_pressure, load_slopes
 from jaxeit.tracking.preparation import squared_line_distances
 from tests.compiled import compiled
 
-from .conftest import in_double_precision
+from .conftest import GAUSSIAN, in_double_precision
 
 LOADS = jnp.array([[0.07, 0.09, np.log(0.012), np.log(15.0), 0, 0], [0.1, 0.1, np.log(0.01), np.log(8.0), 6e-3, 3e-3]])
 
@@ -44,7 +45,7 @@ def sheet(model, whitened):
 @pytest.fixture(scope="module")
 def touched(model):
     """Change of conductivity, S, and the elements that change, the most first."""
-    pressure = sum(load_pressure(load, model.centroids) for load in LOADS)
+    pressure = sum(load_pressure(load, model.centroids, GAUSSIAN) for load in LOADS)
     change = model.background * pressure / (20e3 + pressure)
     return change, jnp.argsort(-change)
 
@@ -149,7 +150,7 @@ def test_what_contacts_show_has_the_slopes_of_differences(exact):
 
 def test_what_contacts_show_is_near_the_full_forward_map(model, tracker, blank, exact):
     """The tails of the second order are left out, and an image stands for the first."""
-    pressure = sum(load_pressure(load, model.centroids) for load in LOADS)
+    pressure = sum(load_pressure(load, model.centroids, GAUSSIAN) for load in LOADS)
     v = je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
     wanted = tracker.filter.compress @ (v - blank[0])
     gain = jnp.zeros(exact.modes.shape[1])
@@ -176,7 +177,7 @@ def test_a_contact_is_as_wide_on_a_small_sheet(side):
     noise = jnp.full(54, 1e-3 * jnp.sqrt(jnp.mean(je.forward(model) ** 2)))
     small = prepare_tracker(model, skin, noise=noise, sigma=model.background)
     pressed = jnp.array([[0.45 * side, 0.4 * side, np.log(0.012), np.log(1.0), 0, 0]])
-    pressure = load_pressure(pressed[0], model.centroids)
+    pressure = load_pressure(pressed[0], model.centroids, GAUSSIAN)
     v = je.forward(model, model.background * (1 + pressure / (20e3 + pressure)))
     wanted = small.filter.compress @ (v - je.forward(model))
     sheet = small.filter.sheet
@@ -197,14 +198,17 @@ def test_single_precision_errs_below_a_tenth_of_the_noise(tracker, exact):
     assert jnp.max(jnp.abs(single - double)) < 0.1
 
 
+@pytest.mark.parametrize("depth", [0.0, 0.01, 0.02])
 @pytest.mark.parametrize("half", [(0.0, 0.0), (1e-3, 0.0), (6e-3, 3e-3), (-0.02, 0.03)])
-def test_slopes_of_a_load_by_hand_are_those_of_jax(half):
+def test_slopes_of_a_load_by_hand_are_those_of_jax(half, depth):
+    """At a depth of 20 mm the load is narrower than a point load becomes."""
+    spreading = Spreading.at_depth(depth, float)
     points = jnp.asarray(np.random.default_rng(0).uniform(0.07, 0.13, (200, 2)))
     load = jnp.array([0.1, 0.1, np.log(0.01), np.log(8.0), *half])
-    value, slopes = load_slopes(load, points)
-    expected = jax.jacfwd(load_pressure)(load, points).T
+    value, slopes = load_slopes(load, points, spreading)
+    expected = jax.jacfwd(load_pressure)(load, points, spreading).T
     size = jnp.abs(expected).max(1)
-    np.testing.assert_allclose(value, load_pressure(load, points), rtol=1e-12)
+    np.testing.assert_allclose(value, load_pressure(load, points, spreading), rtol=1e-12)
     np.testing.assert_array_less(jnp.abs(slopes - expected).max(1), 1e-9 * size + 1e-300)
 
 
@@ -224,5 +228,5 @@ def test_an_edge_of_length_zero_is_a_round_load():
     square = jnp.sum((points - load[:2]) ** 2, -1)
     width, force = jnp.exp(load[2]), jnp.exp(load[3])
     gaussian = force * jnp.exp(-0.5 * square / width**2) / (2 * jnp.pi * width**2)
-    np.testing.assert_allclose(load_pressure(load, points), gaussian, atol=1e-4 * float(gaussian.max()))
-    assert jnp.isclose(load_pressure(LOADS[1], points).sum() * 0.005**2, 8, rtol=1e-3)
+    np.testing.assert_allclose(load_pressure(load, points, GAUSSIAN), gaussian, atol=1e-4 * float(gaussian.max()))
+    assert jnp.isclose(load_pressure(LOADS[1], points, GAUSSIAN).sum() * 0.005**2, 8, rtol=1e-3)

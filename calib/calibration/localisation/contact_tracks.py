@@ -6,6 +6,7 @@ their standard errors, by the calibration, are data of each frame beside its rea
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -51,14 +52,16 @@ def prepare_calibrated_tracker(
     settings: TrackerSettings | None = None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> Tracker:
-    """A tracker of the calibrated skin, whose model errs by as much as presses of the calibration show.
+    """A tracker of the calibrated skin, whose loads spread and whose model errs as presses of the calibration show.
+
+    Where the gain of the contact layer was learned, loads spread as they did then.
 
     Args:
         untouched: mean frame without contact, V.
         noise: standard deviation of the readings of a frame, V; readings without noise are left out. The frame as a
             whole may also drift by `GAIN_DRIFT`.
         settings: of the tracker; default: the usual.
-        tell: called with a line if no sheet fits the untouched frame.
+        tell: called with a line if no sheet fits the untouched frame, or loads spread as at a depth.
 
     Raises:
         NotFollowed: if the noise is not known, or the presses of the calibration do not tell the model error.
@@ -70,14 +73,35 @@ def prepare_calibrated_tracker(
         raise NotFollowed("no reading has noise without contact, so none tells how sure it is")
     model = je.discretise(je.Scene(calibration.skin), LOAD_FIDELITY)
     errors = _covariance(np.where(channels, noise, 1.0), np.where(channels, untouched, 0.0))
-    known = {"settings": settings, "noise": errors, "channels": channels}
-    prepare = partial(je.tracking.prepare_tracker, model, calibration.skin, **known)
+    prepare = partial(
+        je.tracking.prepare_tracker, model, calibration.skin, noise=errors, channels=channels, untouched=untouched
+    )
+    settings = _as_learned(TrackerSettings() if settings is None else settings, calibration)
     try:
-        tracker = prepare(untouched=untouched)
+        tracker = prepare(settings)
     except je.imaging.InverseError as error:
         tell(f"note: {taken_for_even(error)}")
-        tracker = prepare()
-    return _with_model_error(tracker, calibration)
+        prepare = partial(prepare, untouched=None)
+        tracker = prepare(settings)
+    presses = probe_presses(calibration)
+    if presses is None:
+        return tracker
+    if settings.loads.depth is None and (depth := je.tracking.fit_depth(tracker, *presses)):
+        tell(f"presses of the calibration spread as at a depth of {1e3 * depth:.1f} mm in an elastic half-space")
+        tracker = prepare(_at_depth(settings, depth))
+    return _with_model_error(tracker, presses)
+
+
+def _as_learned(settings: TrackerSettings, calibration: Calibration) -> TrackerSettings:
+    """The settings with the depth under which the layer of the calibration was learned, unless they have their own."""
+    if calibration.layer is None or settings.loads.depth is not None:
+        return settings
+    return _at_depth(settings, calibration.layer.field.depth)
+
+
+def _at_depth(settings: TrackerSettings, depth: float) -> TrackerSettings:
+    """The settings with a sheet at a depth, m."""
+    return replace(settings, loads=replace(settings.loads, depth=depth))
 
 
 def _covariance(noise: Float[np.ndarray, " n"], untouched: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
@@ -86,11 +110,8 @@ def _covariance(noise: Float[np.ndarray, " n"], untouched: Float[np.ndarray, " n
     return np.diag(noise**2) + np.outer(drift, drift)
 
 
-def _with_model_error(tracker: Tracker, calibration: Calibration) -> Tracker:
-    """The tracker with the model error that presses of the calibration show, or its own where the file has none."""
-    presses = probe_presses(calibration)
-    if presses is None:
-        return tracker
+def _with_model_error(tracker: Tracker, presses: tuple[np.ndarray, np.ndarray, np.ndarray]) -> Tracker:
+    """The tracker with the model error that presses show."""
     try:
         return je.tracking.fit_model_error(tracker, *presses)
     except je.imaging.InverseError as error:

@@ -72,6 +72,9 @@ class LoadSettings:
     | coat: standard deviation of the log conductivity that the sheet is not known | see below    | 1    |
     |   by; None: 0 for a sheet given or fitted to a frame, 0.15 for an even one    |              |      |
     | coat_length: over which it changes                                           | 0.03         | m    |
+    | depth: of the sheet below the tips in an elastic half-space, by which loads  | None         | m    |
+    |   spread (`je.effects.IndentationSpreading`); 0: loads are Gaussian; None:   |              |      |
+    |   the same until presses tell another depth                                  |              |      |
     | shape: standard deviation of each moment by which a round load differs from a | 0.1          | 1    |
     |   Gaussian (`pressure.shape_directions`)                                     |              |      |
     | shapes: how many times `shape` the even moments may be, and the odd ones,    | 0, 1, 2, 4,  | 1    |
@@ -104,6 +107,7 @@ class LoadSettings:
     texture_length: float = _length(0.0075)
     coat: float | None = limited(None, least=0)
     coat_length: float = _length(COATING_LENGTH)
+    depth: float | None = limited(None, least=0, most=LONGEST, unit="m")
     shape: float = limited(0.1, least=0)
     shapes: tuple[float, ...] = limited((0.0, 1.0, 2.0, 4.0, 8.0), least=0)
     model_error: float = limited(0.005, least=0)

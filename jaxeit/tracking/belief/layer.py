@@ -58,6 +58,8 @@ class GainField(eqx.Module):
     |   looks like, for each mode of this error (`apparent_gain`) |        |      |
     | mesh_error: standard deviation of the log gain that errors | ()     | 1    |
     |   of the mesh look like at a place                         |        |      |
+    | depth: of the sheet, by which loads spread; under another  | ()     | m    |
+    |   one presses show another gain                            |        |      |
     """
 
     places: Float[np.ndarray, "g 2"]
@@ -67,6 +69,7 @@ class GainField(eqx.Module):
     norm: float
     sheet_error: Float[np.ndarray, "g c"]
     mesh_error: float
+    depth: float = 0.0
 
     @classmethod
     def on_sheet(
@@ -80,7 +83,7 @@ class GainField(eqx.Module):
         nodes = field_nodes(corners[0], corners[1], length)
         norm = field_norm(field_bumps(points, nodes, length))
         places = np.concatenate([np.full((1, 2), np.inf), nodes])
-        return cls(places, length, level, loads.gain, norm, np.zeros((len(places), 0)), 0.0)
+        return cls(places, length, level, loads.gain, norm, np.zeros((len(places), 0)), 0.0, loads.depth or 0.0)
 
     def modes_at(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n g"]:
         """Log gain of each mode at points (n, 2) m, per prior standard deviation of the mode."""
@@ -103,7 +106,7 @@ class GainField(eqx.Module):
         """
         tolerance = FIELD_RTOL * self.length
         same = self.places.shape == other.places.shape and np.allclose(self.places[1:], other.places[1:], 0, tolerance)
-        own, others = ([field.length, field.level, field.deviation, field.norm] for field in (self, other))
+        own, others = ([one.length, one.level, one.deviation, one.norm, one.depth] for one in (self, other))
         if not (same and np.allclose(own, others, rtol=FIELD_RTOL)):
             raise InverseError(
                 "the gain of the contact layer was learned on another sheet or under other settings; learn it again"

@@ -26,6 +26,7 @@ def layer_arrays(layer: LearnedLayer) -> dict[str, tuple[Any, str, str]]:
         "layer/places": (field.places[1:], "m", "of the bumps that the log gain of the contact layer is made of"),
         "layer/sheet_error": (field.sheet_error, "1", "modes that each mode of the error of the sheet looks like"),
         "layer/mesh_error": (field.mesh_error, "1", "standard deviation of the log gain that mesh errors look like"),
+        "layer/depth": (field.depth, "m", "of the sheet, by which loads spread; zero: loads are Gaussian"),
         "layer/mean": (layer.means, "1", f"of level and bumps, in their standard deviations before contact, {each}"),
         "layer/covariance": (layer.covariances, "1", "of these"),
         "layer/evidence": (layer.evidence, "1", f"log probability of all presses, {each}"),
@@ -34,15 +35,17 @@ def layer_arrays(layer: LearnedLayer) -> dict[str, tuple[Any, str, str]]:
 
 
 def layer_from(arrays: Mapping[str, np.ndarray]) -> LearnedLayer | None:
-    """What was learned of the contact layer, if anything was; early versions knew no effects of presses, or no
-    errors of sheet and mesh."""
+    """What was learned of the contact layer, if anything was; early versions knew no effects of presses, no errors of
+    sheet and mesh, or no depth of the sheet."""
     if "layer/mean" not in arrays:
         return None
     early, modes = "layer/evidence" not in arrays, np.shape(arrays["layer/mean"])[-1:]
     each = () if early else PRESS_VARIANCES.shape
-    arrays = {"layer/sheet_error": np.zeros((*modes, 0)), "layer/mesh_error": np.zeros(())} | dict(arrays)
-    shapes = {"mean": each + modes, "covariance": each + 2 * modes, "places": (sum(modes) - 1, 2), "mesh_error": ()}
-    shapes |= {"sheet_error": modes + np.shape(arrays["layer/sheet_error"])[1:]}
+    zero = np.zeros(())
+    missing = {"layer/sheet_error": np.zeros((*modes, 0)), "layer/mesh_error": zero, "layer/depth": zero}
+    arrays = missing | dict(arrays)
+    shapes = {"mean": each + modes, "covariance": each + 2 * modes, "places": (sum(modes) - 1, 2)}
+    shapes |= {"mesh_error": (), "depth": (), "sheet_error": modes + np.shape(arrays["layer/sheet_error"])[1:]}
     shapes |= dict.fromkeys(_NUMBERS, ()) | ({} if early else {"evidence": each})
     found = {name: shaped(arrays, f"layer/{name}", shape, "f") for name, shape in shapes.items()}
     for name, array in found.items():
@@ -59,5 +62,5 @@ def layer_from(arrays: Mapping[str, np.ndarray]) -> LearnedLayer | None:
 
 def _field(found: Mapping[str, np.ndarray]) -> GainField:
     places = np.concatenate([np.full((1, 2), np.inf), found["places"]])
-    numbers = {name: float(found[name]) for name in (*_NUMBERS, "mesh_error")}
+    numbers = {name: float(found[name]) for name in (*_NUMBERS, "mesh_error", "depth")}
     return GainField(places, sheet_error=found["sheet_error"], **numbers)
