@@ -31,7 +31,18 @@ import numpy as np
 import jaxeit as je
 from calib.calibration.localisation.contact_tracks import ContactTracks
 from calib.calibration.localisation.learned.law_lessons import ContactLawLearner
-from jaxeit.tracking import ContactLaw, LearnedLayer, Track, Tracker, Tracking, fit_model_error, prepare_tracker
+from jaxeit.contacts import LoadSettings
+from jaxeit.tracking import (
+    ContactLaw,
+    LearnedLayer,
+    Track,
+    Tracker,
+    TrackerSettings,
+    Tracking,
+    fit_depth,
+    fit_model_error,
+    prepare_tracker,
+)
 
 from .force_ways import HELD, LIFTED, PAD_ERROR, SECONDS
 from .harness import Question, Run
@@ -112,9 +123,12 @@ class Session:
 
     def __init__(self, model: je.Model, skin: Skin, seed: int, probes: int):
         self.skin, self.rng = skin, np.random.default_rng([seed, 29])
-        tracker = prepare_tracker(model, je.load_skin("testbed"), noise=skin.noise, untouched=skin.untouched)
+        prepare = partial(prepare_tracker, model, je.load_skin("testbed"), noise=skin.noise, untouched=skin.untouched)
         forces, errors = self.told(skin.pads[:probes])
-        self.tracker: Tracker = fit_model_error(tracker, self.noisy(skin.changes[:probes]), forces, errors)
+        presses = self.noisy(skin.changes[:probes]), forces, errors
+        self.depth = fit_depth(prepare(), *presses)
+        settings = TrackerSettings(loads=LoadSettings(depth=self.depth))
+        self.tracker: Tracker = fit_model_error(prepare(settings), *presses)
 
     def noisy(self, changes: np.ndarray) -> np.ndarray:
         """Frames with their noise."""
@@ -182,7 +196,8 @@ def one_scene(run: Run, scene: str) -> Iterator[Row]:
             for press, pads in product(range(max(stages) + 1, len(skin.forces)), (NONE, DEAD)):
                 for way, each in zip(("gain", "law"), session.alone(press, layer, law, pads), strict=True):
                     rows.append(about | {"way": way, "pads": pads} | judged(each, skin.forces[press]))
-        print(f"{scene}, skin {seed}: {law.mean.round(2)}, evidence {law.evidence:.1f}", flush=True)
+        depth = f"{1e3 * session.depth:.1f} mm"
+        print(f"{scene}, skin {seed}: depth {depth}, {law.mean.round(2)}, evidence {law.evidence:.1f}", flush=True)
     yield {
         scene: [
             {"skin": scene, "pads": pads} | summary(number, mine)

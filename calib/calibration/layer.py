@@ -18,12 +18,11 @@ from .fitted_sessions import is_calibrated_from
 from .localisation.contact_tracks import (
     ContactTracks,
     NotFollowed,
-    pad_errors,
     prepare_calibrated_tracker,
-    probe_presses,
     quiet_tracker,
 )
 from .localisation.learned.law_lessons import ContactLawLearner, updated_law
+from .localisation.learned.probes import pad_errors, probe_presses
 
 # Share of what was learned before that each new session forgets: skins age between sessions, and errors of the model
 # that last for a session are in no covariance.

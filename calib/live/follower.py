@@ -8,7 +8,8 @@ import numpy as np
 from jaxeit.tracking import LearnedLayer, Track, Tracker, TrackerSettings, Tracking, compile_tracker
 
 from ..calibration.calibration import Calibration
-from ..calibration.localisation.contact_tracks import MIN_SECONDS, pad_errors, prepare_calibrated_tracker
+from ..calibration.localisation.contact_tracks import MIN_SECONDS, prepare_calibrated_tracker
+from ..calibration.localisation.learned.probes import pad_errors
 from ..calibration.localisation.quiet_frames import QuietFrames
 from ..check.placement import noted, placement_note
 from .results import TouchEstimates

@@ -15,19 +15,20 @@ from calib.calibration.localisation import contact_tracks
 from calib.calibration.localisation.contact_tracks import (
     GAIN_DRIFT,
     MIN_SECONDS,
-    PAD_SHARE,
     TRACK_ARRAYS,
     ContactTracks,
     NotFollowed,
-    pad_errors,
 )
+from calib.calibration.localisation.learned import probes
+from calib.calibration.localisation.learned.probes import PAD_SHARE, learned_depth, pad_errors
 from calib.calibration.localisation.load_windows import LEARNED, LOAD_ARRAYS
 from calib.calibration.localisation.quiet_frames import QuietFrames
 from calib.cli import main
 from calib.report.track_report import by_number, write_track_report
 from calib.session import read_archive, write_archive
+from jaxeit.contacts import LoadSettings
 from jaxeit.contacts.loads.pressure import MAX_LOADS
-from jaxeit.tracking import Track, Tracker, Tracking
+from jaxeit.tracking import GainField, LearnedLayer, Track, Tracker, TrackerSettings, Tracking
 
 from ..helpers import stand_in
 from ..place_logs import place_log, write_place_log
@@ -74,7 +75,7 @@ def test_a_sheet_that_no_coat_explains_is_taken_for_even(skin, monkeypatch):
     """Else its error is in the deviations of the gain that is learned."""
     asked, untouched = [], np.ones(3)
 
-    def prepare(model, skin, untouched=None, **options):
+    def prepare(model, skin, settings, untouched=None, **options):
         asked.append(untouched)
         if untouched is not None and untouched[0] < 0:
             raise je.imaging.InverseError("no coating explains v0")
@@ -82,6 +83,7 @@ def test_a_sheet_that_no_coat_explains_is_taken_for_even(skin, monkeypatch):
 
     monkeypatch.setattr(je.tracking, "prepare_tracker", prepare)
     monkeypatch.setattr(contact_tracks, "_with_model_error", lambda tracker, _: tracker)
+    monkeypatch.setattr(contact_tracks, "learned_depth", lambda *_: 0.0)
     monkeypatch.setattr(je, "discretise", lambda *_: None)
     calibration = stand_in(Calibration, recon=stand_in(je.Reconstructor, channels=untouched > 0), skin=skin)
     told = []
@@ -92,6 +94,31 @@ def test_a_sheet_that_no_coat_explains_is_taken_for_even(skin, monkeypatch):
     np.testing.assert_array_equal(asked[0], untouched)
     np.testing.assert_array_equal(asked[1], -untouched)
     assert asked[2:] == [None]
+
+
+def test_the_depth_that_presses_tell_is_that_of_the_tracker(skin, monkeypatch):
+    """Unless the settings state one."""
+    asked, told, noise = [], [], np.ones(3)
+    monkeypatch.setattr(je.tracking, "prepare_tracker", lambda _, skin, settings, **kw: asked.append(settings) or FakeTracker())
+    monkeypatch.setattr(contact_tracks, "_with_model_error", lambda tracker, _: tracker)
+    monkeypatch.setattr(contact_tracks, "learned_depth", lambda *_: 0.009)
+    monkeypatch.setattr(je, "discretise", lambda *_: None)
+    calibration = stand_in(Calibration, recon=stand_in(je.Reconstructor, channels=noise > 0), skin=skin)
+    contact_tracks.prepare_calibrated_tracker(calibration, noise, noise, tell=told.append)
+    assert [settings.loads.depth for settings in asked] == [None, 0.009]
+    assert told == ["presses of the calibration spread as at a depth of 9.0 mm in an elastic half-space"]
+    flat = TrackerSettings(loads=LoadSettings(depth=0.0))
+    contact_tracks.prepare_calibrated_tracker(calibration, noise, noise, flat, told.append)
+    assert asked[2:] == [flat]
+
+
+def test_a_layer_keeps_the_depth_under_which_it_was_learned(monkeypatch):
+    """Presses are not asked again; they are where nothing was learned, if the calibration kept any."""
+    monkeypatch.setattr(je.tracking, "fit_depth", lambda tracker, *presses: 0.007)
+    monkeypatch.setattr(probes, "probe_presses", lambda calibration: calibration.probes)
+    learned = stand_in(LearnedLayer, field=stand_in(GainField, depth=0.012))
+    for layer, presses, expected in ((learned, (1,), 0.012), (None, (1,), 0.007), (None, None, 0.0)):
+        assert learned_depth(stand_in(Calibration, layer=layer, probes=presses), FakeTracker()) == expected
 
 
 def test_a_drift_of_all_readings_is_noise():

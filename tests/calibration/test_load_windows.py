@@ -11,6 +11,7 @@ import calib
 import jaxeit as je
 from calib.bench import load_bench, simulate
 from calib.calibration.localisation import load_windows
+from calib.calibration.localisation.learned import loads
 from calib.calibration.localisation.learned.loads import MAX_PRESSES, MIN_PRESSES, learned_loads, render_loads
 from calib.calibration.localisation.load_windows import WindowedFrames
 from calib.calibration.localisation.proposals import chosen_proposal
@@ -103,12 +104,14 @@ def test_whole_presses_of_a_calibration_tell_loads(calibration, model, monkeypat
     probes.dv[0, 5] = np.nan  # of a reading that is not used
     probes.dv[2, 7] = np.nan
 
-    def learn(_, dv, position, force, *, gain, **sheet):
+    def learn(_, dv, position, force, settings, *, gain, **sheet):
+        assert settings.depth == 0.008
         given.append((dv, position, force, gain))
         assert sheet.keys() == {"noise", "channels"}
         return je.contacts.LoadSettings(texture=0.1)
 
     monkeypatch.setattr(je.contacts, "learn_loads", learn)
+    monkeypatch.setattr(loads, "depth_of_loads", lambda *_: 0.008)
     known = {"noise": np.ones(readings), "channels": channels}
     found, line = learned_loads(replace(calibration, probes=probes), model, known)
     assert found.texture == 0.1
@@ -133,6 +136,7 @@ def test_presses_whose_fits_do_not_converge_tell_nothing(calibration, model, mon
         raise InverseError("no fit converges")
 
     monkeypatch.setattr(je.contacts, "learn_loads", learn)
+    monkeypatch.setattr(loads, "depth_of_loads", lambda *_: 0.008)
     readings = calibration.recon.readings
     probes = replace(calibration, probes=presses(MIN_PRESSES, readings, 4))
     found, line = learned_loads(probes, model, {"channels": np.ones(readings, bool)})

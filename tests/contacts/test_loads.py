@@ -24,6 +24,7 @@ from jaxeit.contacts.loads.pressure import (
     shape_directions,
     spot,
 )
+from jaxeit.contacts.loads.spreading import Spreading
 from jaxeit.imaging import InverseError
 from jaxeit.model.forward_model import transfer
 from jaxeit.model.gaussian_field import field_modes
@@ -142,6 +143,7 @@ def test_a_blank_frame_holds_nothing(ready):
     assert found.probability[0] == 1
 
 
+GAUSSIAN = Spreading.at_depth(0.0, float)
 SPOT = jnp.array([0.1, 0.1, np.log(0.01), np.log(7.0), 0.0, 0.0])
 LONG = SPOT.at[4:].set(jnp.array([0.02, 0.01]))
 
@@ -163,7 +165,8 @@ def test_pressure_of_loads_sums_to_their_force():
     points, area = grid_of_sheet()
     for one in (SPOT, LONG):
         assert float(jnp.sum(compiled(line, one, points)) * area) == pytest.approx(7.0, rel=1e-6)
-    assert float(jnp.sum(compiled(pressure, *rows(SPOT, LONG), points)) * area) == pytest.approx(14.0, rel=1e-6)
+    both = compiled(pressure, *rows(SPOT, LONG), points, GAUSSIAN)
+    assert float(jnp.sum(both) * area) == pytest.approx(14.0, rel=1e-6)
     short = SPOT.at[4].set(1e-6)
     np.testing.assert_allclose(compiled(line, short, points), compiled(spot, SPOT, points), rtol=1e-4, atol=1.0)
 
@@ -187,7 +190,7 @@ def test_halves_of_a_split_load_have_the_moments_of_elongations():
     step = 0.15 * 0.01 * jnp.array([np.cos(0.4), np.sin(0.4)])
     width = 0.5 * jnp.log(jnp.exp(2 * SPOT[2]) - 0.5 * step @ step)
     halves = [SPOT.at[:2].add(way * step).at[2].set(width).at[3].add(-np.log(2.0)) for way in (1, -1)]
-    change = np.asarray(compiled(pressure, *rows(*halves), points) - compiled(spot, SPOT, points))
+    change = np.asarray(compiled(pressure, *rows(*halves), points, GAUSSIAN) - compiled(spot, SPOT, points))
     u = np.asarray(step) / 0.01
     expected = np.asarray(compiled(elongations, SPOT, points)) @ np.array([(u[0] ** 2 - u[1] ** 2) / 2, u[0] * u[1]])
     assert np.abs(change - expected).max() < 0.05 * np.abs(expected).max()

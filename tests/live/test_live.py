@@ -24,7 +24,8 @@ from benchmarks import bench_live
 from calib.bench import Bench, Timing, simulate
 from calib.calibration.application.force_maps import ForceModel, fused
 from calib.calibration.evaluation import Evaluation
-from calib.calibration.localisation.contact_tracks import PAD_SHARE, NotFollowed, prepare_calibrated_tracker
+from calib.calibration.localisation.contact_tracks import NotFollowed, prepare_calibrated_tracker
+from calib.calibration.localisation.learned.probes import PAD_SHARE
 from calib.check.placement import NOTE
 from calib.cli import main
 from calib.fitting.curves.fitted import FittedCurve

@@ -27,13 +27,12 @@ from jaxeit.tracking import (
 
 from ..application.frame_blocks import FrameBlocks
 from ..calibration import Calibration
+from .learned.probes import learned_depth, pad_errors, probe_presses
 from .load_windows import LOAD_FIDELITY
 from .press_images import taken_for_even
 from .quiet_frames import ENOUGH_FRAMES, QuietFrames
 
 MIN_SECONDS = 1e-4  # between frames; those that arrive together bear about the same time
-# Part of a pad's force by which curve and shape of the load may err; its standard error is that of the pressure alone.
-PAD_SHARE = 0.05
 # Standard deviation of the gain that all readings share, as current source and amplifiers warm. Without it a drift of a
 # ten-thousandth, which is as loud as the noise, is explained by weak and wide contacts.
 GAIN_DRIFT = 1e-3
@@ -76,27 +75,17 @@ def prepare_calibrated_tracker(
     prepare = partial(
         je.tracking.prepare_tracker, model, calibration.skin, noise=errors, channels=channels, untouched=untouched
     )
-    settings = _as_learned(TrackerSettings() if settings is None else settings, calibration)
+    settings = TrackerSettings() if settings is None else settings
     try:
         tracker = prepare(settings)
     except je.imaging.InverseError as error:
         tell(f"note: {taken_for_even(error)}")
         prepare = partial(prepare, untouched=None)
         tracker = prepare(settings)
-    presses = probe_presses(calibration)
-    if presses is None:
-        return tracker
-    if settings.loads.depth is None and (depth := je.tracking.fit_depth(tracker, *presses)):
+    if settings.loads.depth is None and (depth := learned_depth(calibration, tracker)):
         tell(f"presses of the calibration spread as at a depth of {1e3 * depth:.1f} mm in an elastic half-space")
         tracker = prepare(_at_depth(settings, depth))
-    return _with_model_error(tracker, presses)
-
-
-def _as_learned(settings: TrackerSettings, calibration: Calibration) -> TrackerSettings:
-    """The settings with the depth under which the layer of the calibration was learned, unless they have their own."""
-    if calibration.layer is None or settings.loads.depth is not None:
-        return settings
-    return _at_depth(settings, calibration.layer.field.depth)
+    return _with_model_error(tracker, calibration)
 
 
 def _at_depth(settings: TrackerSettings, depth: float) -> TrackerSettings:
@@ -110,8 +99,11 @@ def _covariance(noise: Float[np.ndarray, " n"], untouched: Float[np.ndarray, " n
     return np.diag(noise**2) + np.outer(drift, drift)
 
 
-def _with_model_error(tracker: Tracker, presses: tuple[np.ndarray, np.ndarray, np.ndarray]) -> Tracker:
-    """The tracker with the model error that presses show."""
+def _with_model_error(tracker: Tracker, calibration: Calibration) -> Tracker:
+    """The tracker with the model error that presses of the calibration show, or its own where the file has none."""
+    presses = probe_presses(calibration)
+    if presses is None:
+        return tracker
     try:
         return je.tracking.fit_model_error(tracker, *presses)
     except je.imaging.InverseError as error:
@@ -138,21 +130,6 @@ def quiet_tracker(
         if quiet.count >= ENOUGH_FRAMES:
             break
     return prepare_calibrated_tracker(calibration, quiet.untouched, quiet.noise, settings, tell)
-
-
-def probe_presses(calibration: Calibration) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Frames of presses of the calibration (n, readings) V, the forces on the pads and their errors (n, pads) N; None
-    for a calibration of an early version, which kept none."""
-    probes = calibration.probes
-    if probes is None:
-        return None
-    force, error, _ = calibration.pad_forces(probes.pressure)
-    return probes.dv, force, pad_errors(force, error)
-
-
-def pad_errors(force: Float[np.ndarray, "*n pads"], error: Float[np.ndarray, "*n pads"]) -> np.ndarray:
-    """Standard errors of the forces on pads as data for a tracker, N."""
-    return np.asarray(np.hypot(error, PAD_SHARE * force))
 
 
 class ContactTracks:

@@ -24,6 +24,7 @@ from .fitter import LoadFitter
 from .pressure import LOAD_PARAMETERS, MAX_LOADS, LoadForm
 from .settings import LoadSettings
 from .sheet import AbstractGain, KnownGain, PressedSheet
+from .spreading import Spreading
 from .starts import Starts
 
 # Number of elements whose changes count, over that of those within so many widths of the middle of a usual load. Half
@@ -126,6 +127,7 @@ def _sheet(
         untouched_coat_slopes=put(np.zeros((len(factor), modes.shape[1]))),
         shape=put(settings.shape),
         law=settings.law,
+        spreading=Spreading.at_depth(settings.depth or 0.0, model.dtype),
         element_count=min(len(centroids), ELEMENT_FACTOR * _max_count_within(centroids, REACH_WIDTHS * settings.width)),
         known_gain=known_gain,
     )

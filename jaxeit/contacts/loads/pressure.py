@@ -8,6 +8,7 @@ and how, is an array of `LoadForm`. What kinds there are, and of which forms, is
 import math
 from collections.abc import Callable
 from enum import IntEnum
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from jax.scipy.special import erf
 from jaxtyping import Array, Bool, Float, Int
 
 from .result import LoadKind
+from .spreading import Spreading
 
 
 class LoadForm(IntEnum):
@@ -67,9 +69,11 @@ def free_parameters(forms: Int[np.ndarray, " n"]) -> Bool[np.ndarray, "n 6"]:
     return free
 
 
-def pressure(loads: Parameters, forms: Forms, points: Float[Array, "... 2"]) -> Float[Array, "..."]:
+def pressure(
+    loads: Parameters, forms: Forms, points: Float[Array, "... 2"], spreading: Spreading
+) -> Float[Array, "..."]:
     """Pressure of all loads at points, Pa."""
-    kinds = (_no_pressure, spot, line)
+    kinds = (_no_pressure, partial(spreading.pressure, spot), partial(spreading.pressure, line))
     return jnp.stack([jax.lax.switch(form, kinds, load, points) for load, form in zip(loads, forms, strict=True)]).sum(
         0
     )

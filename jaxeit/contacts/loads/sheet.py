@@ -22,6 +22,7 @@ from ...model.forward_model import fields, series_resistance, transfer
 from ...model.sensitivity import element_slopes
 from ...model.sheet_conductivity import coefficients
 from .pressure import Forms, Parameters, elongations, pressure, shape_directions, tilt_directions
+from .spreading import Spreading
 
 MAX_MODES = 72  # of the gain, those that change the readings of the loads most; and as many of its texture
 
@@ -100,6 +101,7 @@ class PressedSheet(eqx.Module):
     | coat: modes of the log conductivity that is not known                 | (elements, c)    | 1     |
     | untouched_coat_slopes: of the whitened readings in these without loads | (r, c)          |       |
     | shape: standard deviation of the moments of a load's shape            | ()               | 1     |
+    | spreading: of loads on their way to the sheet                         |                  |       |
     | element_count: number of elements that loads change                   |                  |       |
     | known_gain: None: its modes have a deviation of one, and mean zero    |                  |       |
     """
@@ -117,6 +119,7 @@ class PressedSheet(eqx.Module):
     untouched_coat_slopes: Float[Array, "r c"]
     shape: Float[Array, ""]
     law: ContactPiezoresistance
+    spreading: Spreading
     element_count: int = eqx.field(static=True)
     known_gain: KnownGain | None = None
 
@@ -145,7 +148,7 @@ class PressedSheet(eqx.Module):
         at = self.linearise(loads, forms)
         points = self.points[at.elements]
         factor = self._gain_factor(at.elements)
-        effective = pressure(loads, forms, points) * factor
+        effective = pressure(loads, forms, points, self.spreading) * factor
         slope = jax.jvp(self.law.factor, (effective,), (jnp.ones_like(effective),))[1]
         by_pressure = self.sigma[at.elements, None] * slope * self.weights
         by_gain, by_pressure = jnp.sum(by_pressure * effective, 1), by_pressure * factor
@@ -185,7 +188,8 @@ class PressedSheet(eqx.Module):
         self, loads: Parameters, forms: Forms, elements: Int[Array, " e"] | slice = slice(None)
     ) -> Float[Array, " e"]:
         """Conductivity of elements under loads, S."""
-        effective = pressure(loads, forms, self.points[elements]) * self._gain_factor(elements)
+        spread = pressure(loads, forms, self.points[elements], self.spreading)
+        effective = spread * self._gain_factor(elements)
         return self.sigma[elements] * (self.law.factor(effective) @ self.weights)
 
     def _changed_elements(self, loads: Parameters, forms: Forms) -> Int[Array, " e"]:

@@ -9,6 +9,7 @@ from jaxeit.contacts import LoadSettings
 from jaxeit.contacts.loads import scaled_law
 
 from ...calibration import Calibration
+from .probes import depth_of_loads
 
 MIN_PRESSES, MAX_PRESSES = 12, 16  # presses from which loads are learned; more take longer and hardly tell more
 
@@ -32,7 +33,8 @@ def learned_loads(calibration: Calibration, model: je.Model, known: dict[str, An
         return None, f"nothing, as {count}, and {MIN_PRESSES} are needed"
     frames, places, forces = probes.dv[whole], probes.position[whole], probes.force[whole]
     try:
-        learned = je.contacts.learn_loads(model, frames, places, forces, gain=calibration.layer, **known)
+        usual = LoadSettings(depth=depth_of_loads(calibration, model, known))
+        learned = je.contacts.learn_loads(model, frames, places, forces, usual, gain=calibration.layer, **known)
     except je.imaging.InverseError as error:
         return None, f"nothing by the presses of the calibration: {error}"
     return learned, render_loads(learned)
@@ -43,6 +45,8 @@ def render_loads(loads: LoadSettings) -> str:
     line = f"pressure adds {_law_text(loads.law)}"
     if any(loads.forces.logs):
         line += f", and for the forces told {_law_text(scaled_law(loads.law, loads.forces.logs))}"
+    if loads.depth:
+        line += f"; loads spread as at a depth of {1e3 * loads.depth:.1f} mm"
     return f"{line}; texture {loads.texture:.2f}, model error {100 * loads.model_error:.1f} %"
 
 
