@@ -99,7 +99,12 @@ def test_a_sheet_that_no_coat_explains_is_taken_for_even(skin, monkeypatch):
 def test_the_depth_that_presses_tell_is_that_of_the_tracker(skin, monkeypatch):
     """Unless the settings state one."""
     asked, told, noise = [], [], np.ones(3)
-    monkeypatch.setattr(je.tracking, "prepare_tracker", lambda _, skin, settings, **kw: asked.append(settings) or FakeTracker())
+
+    def prepare(model, skin, settings, **_):
+        asked.append(settings)
+        return FakeTracker()
+
+    monkeypatch.setattr(je.tracking, "prepare_tracker", prepare)
     monkeypatch.setattr(contact_tracks, "_with_model_error", lambda tracker, _: tracker)
     monkeypatch.setattr(contact_tracks, "learned_depth", lambda *_: 0.009)
     monkeypatch.setattr(je, "discretise", lambda *_: None)
