@@ -291,8 +291,8 @@ def summary(presses: Any, rows: Sequence[Row], before: Sequence[Row]) -> Row:
         found[f"{name} worse"] = sum(bool(means[seed] > first[seed]) for seed in means)
         found[f"{name} worst"] = round(max(float(means[seed] / first[seed]) for seed in means), 3)
         found[f"{name} ratios"] = [round(float(means[seed] / first[seed]), 3) for seed in means]
-    depths = 1e3 * np.array([some[0]["depth"] for some in grouped(rows, "seed").values()])
-    found["depths mm"] = [round(float(depth), 1) for depth in depths]
+    depths = [1e3 * some[0]["depth"] for some in grouped(rows, "seed").values()]
+    found |= {"depth low": round(min(depths), 1), "depth high": round(max(depths), 1)}
     return found | {"law used": len({row["seed"] for row in rows if row["law"]})}
 
 

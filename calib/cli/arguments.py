@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import errno
 import os
+from collections import ChainMap
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, overload
@@ -54,6 +55,11 @@ def add_tracking_arguments(parser: argparse.ArgumentParser, text: str) -> None:
     parser.add_argument("--no-learn", action="store_true", help=text)
     text = "with --track: part of the variance that contacts took from that gain, which an hour gives back; default: 0"
     parser.add_argument("--forget", type=float, metavar="PART", help=text)
+    text = (
+        "with --track: depth of the sheet below the tips in an elastic half-space, m, by which loads spread; "
+        "0: loads are Gaussian; default: as the presses of the calibration tell"
+    )
+    parser.add_argument("--depth", type=float, metavar="METRES", help=text)
 
 
 def tracking_of(args: argparse.Namespace) -> "bool | je.tracking.TrackerSettings":
@@ -65,15 +71,18 @@ def tracking_of(args: argparse.Namespace) -> "bool | je.tracking.TrackerSettings
     from jaxeit.tracking import TrackerSettings
 
     settings = settings_of_option(args, "tracker", TrackerSettings)
-    changes: dict[str, Any] = {"learn": False} if args.no_learn else {}
-    changes |= {} if args.forget is None else {"forgetting": args.forget}
+    usual = settings or TrackerSettings()
+    changes: dict[str, dict[str, Any]] = {"--no-learn": {"learn": False}} if args.no_learn else {}
+    changes |= {} if args.forget is None else {"--forget": {"forgetting": args.forget}}
+    if args.depth is not None:
+        changes["--depth"] = {"loads": dataclasses.replace(usual.loads, depth=args.depth)}
     if settings is None and not args.track:
         if changes:
-            option = "--no-learn" if args.no_learn else "--forget"
+            option = next(iter(changes))
             raise ValueError(f"{option}: it is about contacts that are followed; add --track, or leave it out")
         return False
     if changes:
-        return dataclasses.replace(settings or TrackerSettings(), **changes)
+        return dataclasses.replace(usual, **dict(ChainMap(*changes.values())))
     return True if settings is None else settings
 
 

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -301,6 +302,8 @@ def test_a_scene_served_as_a_device(presses_file, tmp_path):
         (["--tracker", "5"], "--tracker 5: 5: unknown key; known: acceleration"),
         (["--no-learn"], "--no-learn: it is about contacts that are followed; add --track"),
         (["--forget", "0.1"], "--forget: it is about contacts that are followed; add --track"),
+        (["--depth", "0.01"], "--depth: it is about contacts that are followed; add --track"),
+        (["--track", "--depth", "-0.01"], "LoadSettings: depth is -0.01 m; give 0 to 1 m"),
         (["--track", "--forget", "1"], "TrackerSettings: forgetting is 1; give 0 to less than 1"),
         (["--track", "--forget", "nan"], "TrackerSettings: forgetting is nan; give 0 to less than 1"),
         (["--track", "--forget", "-0.1"], "TrackerSettings: forgetting is -0.1; give 0 to less than 1"),
@@ -330,6 +333,7 @@ def test_settings_of_contacts_reach_apply_and_live(tmp_path, monkeypatch):
     parser = argparse.ArgumentParser()
     live_command.add_arguments(parser)
     live = ["--calibration", "c.h5", "--pressure", "p"]
+    deep = replace(TrackerSettings().loads, depth=0.009)
     follow = {
         (): False,
         ("--track",): True,
@@ -338,6 +342,7 @@ def test_settings_of_contacts_reach_apply_and_live(tmp_path, monkeypatch):
         ("--tracker", "most=4,learn=false"): TrackerSettings(most=4, learn=False),
         ("--tracker", "most=4", "--no-learn"): TrackerSettings(most=4, learn=False),
         ("--track", "--forget", "0.2"): TrackerSettings(forgetting=0.2),
+        ("--tracker", "most=4", "--depth", "0.009"): TrackerSettings(most=4, loads=deep),
         ("--tracker", "most=4,forgetting=0.3"): TrackerSettings(most=4, forgetting=0.3),
     }
     for more, track in follow.items():
