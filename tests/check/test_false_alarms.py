@@ -14,7 +14,7 @@ from calib.cli import main
 from calib.session import SessionFacts, StreamFacts, open_session
 
 from ..helpers import REAL_DATA
-from .honest import honest_bench
+from .honest import honest_bench, sixteen_presses
 from .recording import SECOND, Recording, Samples
 
 TRUE_WARNINGS = {
@@ -60,6 +60,24 @@ def test_a_shipped_scene_is_not_accused(name, transfers, tmp_path):
     with open_session(path) as session:
         report = check_session(session, transfer=transfers[bench.scene.skin.name])
     assert report.ok, [f for f in report.findings if f.severity is Severity.ERROR]
+
+
+def test_presses_that_eit_hardly_sees_are_not_those_of_another_time(tmp_path):
+    """Nine presses of varied force, most far from the electrodes, resemble the presses next to them by chance."""
+    text = (
+        je.load_skin("testbed")
+        .toml.replace("pitch = 0.04", "pitch = 0.025")
+        .replace("columns = 5", "columns = 4")
+        .replace("rows = 5", "rows = 4")
+    )
+    skin = je.skin.parse_skin(text.replace("origin = [0.02, 0.02]", "origin = [0.0625, 0.0625]"))
+    sites = np.random.default_rng(6).uniform(0.012, 0.188, (9, 2)).round(4)
+    bench = sixteen_presses(skin, blank=3.0, pad_rate=100.0)
+    bench = dataclasses.replace(bench, sites=sites, forces=np.array([3.0, 6.0, 10.0]))
+    path = simulate(bench, tmp_path / "s.h5", fidelity=je.Fidelity.draft(edge_length=0.05))
+    with open_session(path) as session:
+        report = check_session(session)
+    assert report.ok, report.findings
 
 
 def real(name):

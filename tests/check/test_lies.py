@@ -542,6 +542,10 @@ LIES = {
     "EIT 0.5 s late": Lie(late("eit", 0.5), ERROR, ("/streams/eit", "after the force")),
     "pressure 0.5 s early": Lie(late("pressure", -0.5), ERROR, ("/streams/pressure", "0.500 s before the force")),
     "pressure 7 s late": Lie(late("pressure", 7.0), ERROR, ("/streams/pressure", "7.000 s after", "when moved")),
+    "EIT 3.3 s late, a press": Lie(late("eit", 3.3), ERROR, ("/streams/eit", "3.300 s after", "when moved")),
+    "pressure 3.3 s early, a press": Lie(
+        late("pressure", -3.3), ERROR, ("/streams/pressure", "3.300 s before", "when moved")
+    ),
     "EIT 9 s late": Lie(late("eit", 9.0), ERROR, ("/streams/eit", "9.000 s after", "when moved")),
     "pressure 0.3 s late": Lie(late("pressure", 0.3), ERROR, ("/streams/pressure", "0.300 s after the force")),
     "pressure 3.1 s late": Lie(late("pressure", 3.1), ERROR, ("/streams/pressure", "3.100 s after the force")),

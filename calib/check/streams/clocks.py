@@ -22,6 +22,8 @@ SLOW = 30.0  # s: what is slower is drift
 MAX_LAG = 60.0  # s
 MIN_CHANGE_SHARE = 0.25  # of a change of the delays, by which the lags of the halves must differ
 MIN_CORRELATION, MIN_GAIN = 0.7, 0.3  # of the streams when moved by the lag, and over that when they are not moved
+CHANCE_SPREADS = 2.5  # of Fisher's z of two correlations over presses: less may be by chance
+MIN_FISHER, MAX_FISHER = 3, 1 - 1e-9  # presses, at which z has no finite spread; correlation, of which z is finite
 
 
 def beside(delay: float) -> str:
@@ -41,22 +43,28 @@ def compare_clocks(
     streams = {name: statistics[name].stream for name in moving}
     onsets = onset_delays(force.stream, streams.values(), presses, windows)
     ramp = float(np.median(presses.t_hold0 - presses.t_press)) / SECOND
+    starts = presses.t_press[presses.accepted]
     for name, onset in onsets.items():
         allowed = max(ALLOWED_SHIFT * ramp, MIN_ALLOWED_SHIFT) + 2 / streams[name].nominal_rate
-        what = _clock_text(force, statistics[name], onset, allowed, ramp)
+        what = _clock_text(force, statistics[name], onset, allowed, ramp, starts)
         if what:
             findings.append(_disagreement(name, what))
     return tuple(sorted(onsets.items()))
 
 
 def _clock_text(
-    force: StreamStatistics, stats: StreamStatistics, onset: OnsetDelay, allowed: float, ramp: float
+    force: StreamStatistics,
+    stats: StreamStatistics,
+    onset: OnsetDelay,
+    allowed: float,
+    ramp: float,
+    starts: np.ndarray,
 ) -> str:
     """How the clock of a stream disagrees with that of the force; empty if it does not."""
     if len(force.time) < 2 or len(stats.time) < 2 or not force.finite.any():
         return ""
     late = onset.presses and abs(onset.shift) > max(allowed, DELAY_SPREADS * onset.spread)
-    whole = _lag(force, stats, -np.inf, np.inf)
+    whole = _lag(force, stats, -np.inf, np.inf, starts)
     # A tip that slides changes the readings late, and their activity with the force.
     late = late and (onset.shift < ramp / 2 or abs(whole.seconds - onset.delay) < 2 * allowed)
     # A stream that is late by more than a press rises with another press.
@@ -65,7 +73,7 @@ def _clock_text(
     if whole.clear:
         return f"comes {whole.text}"
     middle = float(force.time[0] + force.time[-1]) / 2
-    first, second = _lag(force, stats, -np.inf, middle), _lag(force, stats, middle, np.inf)
+    first, second = _lag(force, stats, -np.inf, middle, starts), _lag(force, stats, middle, np.inf, starts)
     for name, half in (("first", first), ("second", second)):
         if half.clear and abs(half.seconds) > allowed:
             return f"comes, in the {name} half of the recording, {half.text}; a clock has jumped, or samples were lost"
@@ -86,8 +94,11 @@ class _Lag(NamedTuple):
     text: str
 
 
-def _lag(force: StreamStatistics, stats: StreamStatistics, start: float, stop: float) -> _Lag:
-    """The lag of a stream after the force by their samples from ``start`` to ``stop`` (ns)."""
+def _lag(force: StreamStatistics, stats: StreamStatistics, start: float, stop: float, starts: np.ndarray) -> _Lag:
+    """The lag of a stream after the force by their samples from ``start`` to ``stop`` (ns).
+
+    ``starts`` are the times of the presses, ns.
+    """
     here, there = ((t >= start) & (t <= stop) for t in (force.time, stats.time))
     if here.sum() < 2 or there.sum() < 2:
         return _Lag(0.0, False, "")
@@ -96,7 +107,26 @@ def _lag(force: StreamStatistics, stats: StreamStatistics, start: float, stop: f
     lag, moved, unmoved = stream_lag((force.time[here], values[here]), second)
     alike = f"they correlate by {moved:.2f} when moved by as much, by {unmoved:.2f} as recorded"
     clear = moved > MIN_CORRELATION and moved - abs(unmoved) > MIN_GAIN
+    starts = starts[(starts >= start) & (starts <= stop)]
+    if clear and len(starts) and _of_whole_presses(lag, starts):
+        clear = not _by_chance(moved, unmoved, len(starts))
     return _Lag(lag, clear, f"{beside(lag)} the force: {alike}")
+
+
+def _of_whole_presses(lag: float, starts: np.ndarray) -> bool:
+    """Whether a lag, s, moves most presses to the times of others, so that all rises agree with it and without it."""
+    moved = starts + round(lag * SECOND)
+    within = moved[(moved > starts[0] - SECOND) & (moved < starts[-1] + SECOND)]
+    away = np.abs(within[:, None] - starts).min(1)
+    return len(within) > 0 and bool(np.median(away) < MIN_ALLOWED_SHIFT * SECOND)
+
+
+def _by_chance(moved: float, unmoved: float, presses: int) -> bool:
+    """Whether so few presses, on places of uneven sensitivity, may correlate better with others than with their own."""
+    if presses <= MIN_FISHER:
+        return True
+    spread = np.sqrt(2 / (presses - MIN_FISHER))  # of the difference of two correlations, by Fisher's z
+    return bool(np.arctanh(min(moved, MAX_FISHER)) - np.arctanh(abs(unmoved)) < CHANCE_SPREADS * spread)
 
 
 def stream_lag(
