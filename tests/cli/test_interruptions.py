@@ -145,6 +145,30 @@ def test_an_interruption_within_a_collection_of_garbage_ends_the_command(number,
     assert main(["doctor"]) == status
 
 
+LEAVING = """
+import atexit, sys
+from calib.cli import __main__, commands
+from calib.cli.commands.skins import doctor_command
+def run(args):
+    atexit.register(print, "taken down")
+    print("begun")
+    {end}
+doctor_command.run = run
+sys.argv = ["jaxeit", "doctor"]
+__main__.run()
+"""
+
+
+@pytest.mark.parametrize(
+    ("end", "status", "taken_down"),
+    [("raise KeyboardInterrupt", 130, ""), ("raise ValueError('x')", 2, ""), ("return 0", 0, "taken down\n")],
+)
+def test_a_command_cut_short_does_not_wait_for_what_still_computes(end, status, taken_down):
+    """Python would wait for computations of JAX, and some processes ended by a segmentation fault."""
+    ended = subprocess.run([sys.executable, "-c", LEAVING.format(end=end)], stdout=subprocess.PIPE, text=True)
+    assert (ended.returncode, ended.stdout) == (status, f"begun\n{taken_down}")
+
+
 COMPILING = """
 import hashlib
 from calib.cli.signals import heard_at_once, orderly_end
