@@ -84,6 +84,25 @@ def test_ten_presses_of_known_force_restore_the_forces(calibration, moved, later
     assert after < 0.02  # the misfit of places is 0.0075, that of ten places 0.0075 / sqrt(2.5)
 
 
+@pytest.mark.parametrize("unit", [9.80665, 9.80665e-3], ids=["kg", "g"])
+def test_forces_of_another_unit_move_no_calibration(unit, calibration, later, tmp_path):
+    """A move that no drift explains is refused, unless so much drift is expected, or it is forced."""
+    path = later.record(tmp_path / "ten.h5", TEN, FORCE, gains=GAINS, offset=OFFSET, load_cell=FORCE / unit)
+    with calib.open_session(path) as session:
+        with pytest.raises(calib.SessionError, match="check the units and gains of force"):
+            calib.recalibrate(calibration, session)
+        assert calib.recalibrate(calibration, session, ignore_errors=True).recalibration.determined.any()
+
+
+def test_a_large_drift_that_is_expected_is_no_wrong_unit(calibration, later, tmp_path):
+    path = later.record(tmp_path / "ten.h5", TEN, FORCE, gains=1.8 * GAINS, load_cell=FORCE)
+    with calib.open_session(path) as session:
+        with pytest.raises(calib.SessionError, match="beyond the drift of 14 %"):
+            calib.recalibrate(calibration, session)
+        found = calib.recalibrate(calibration, session, KnownForces(GainDrift(0.3, 0.3))).recalibration
+    np.testing.assert_allclose(found.log_gain, np.log(1.8 * GAINS), atol=0.06)
+
+
 def test_levels_at_rest_are_told_and_taken_off(moved):
     found = moved.recalibration
     np.testing.assert_allclose(found.offset_change, OFFSET, atol=2)

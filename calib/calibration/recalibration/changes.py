@@ -140,9 +140,11 @@ class Recalibration:
     @property
     def health(self) -> str:
         """How far off the calibration was, since when, and what to do, in one line."""
-        return health_line(self.since, self.until, self.days, self._moves(), self.advice)
+        return health_line(self.since, self.until, self.days, self.moves, self.advice)
 
-    def _moves(self) -> str:
+    @property
+    def moves(self) -> str:
+        """How far the pads have moved, in words."""
         known = np.flatnonzero(self.determined)
         if not len(known):
             return "the gains of the pads"

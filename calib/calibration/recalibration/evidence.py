@@ -23,7 +23,9 @@ from .press_noise import PressNoise
 
 
 class AbstractEvidence(abc.ABC):
-    """What gains are updated from."""
+    """What gains are updated from. `drift`: how far gains may have moved."""
+
+    drift: GainDrift
 
     @property
     @abc.abstractmethod

@@ -29,6 +29,7 @@ C = TypeVar("C", Calibration, LogCalibration)
 
 MIN_PRESSES = 3  # of a session that can be used; fewer are refused
 BEYOND = 0.3  # of the calibrated range of pressure, by which the pads may read more than was calibrated
+MAX_DRIFTS = 3.0  # standard deviations of what may have drifted, beyond which a unit or a pad is wrong
 MIN_SHARE = 0.02  # of a press; a pad with less of it counts as not loaded
 
 
@@ -45,7 +46,8 @@ def recalibrate(
 
     Raises:
         SessionError: if the session was recorded on another skin, has too few presses or contacts, or determines the
-            gain of no pad, or has moved the calibration before.
+            gain of no pad, or has moved the calibration before; or if a gain has moved by more than three
+            standard deviations of what may have drifted, as by a force in kg.
         RecordingError: if `check_session` finds an error in what is used of the session.
     """
     require_session(session, "recalibrate")
@@ -61,8 +63,8 @@ def _moved(
     """`recalibrate` for the calibration of a skin."""
     require_not_moved_by(calibration.provenance, session)
     found = assess(calibration, session, evidence, ignore_errors=ignore_errors)
-    if not found.determined.any() and not ignore_errors:
-        raise SessionError(f"{session.name}: {found.health}; or move it all the same (--force, ignore_errors=True)")
+    if not ignore_errors:
+        _require_plausible(found, calibration, evidence, session)
     history = [calibration.provenance.get("recalibrations", ""), found.summary()]
     return replace(
         calibration,
@@ -73,6 +75,23 @@ def _moved(
         simulated=calibration.simulated or session.simulated,
         notes=(*calibration.notes, found.health, *found.notes),
     )
+
+
+def _require_plausible(
+    found: Recalibration, calibration: Calibration, evidence: AbstractEvidence | None, session: Session
+) -> None:
+    """Refuse a session that determines no gain, and gains that have moved beyond all drift, as by a wrong unit."""
+    anyway = "or move it all the same (--force, ignore_errors=True)"
+    if not found.determined.any():
+        raise SessionError(f"{session.name}: {found.health}; {anyway}")
+    drift = GainDrift() if evidence is None else evidence.drift
+    use = found.evidence is Evidence.ORDINARY_USE
+    expected = np.sqrt(np.diag(gain_prior(calibration, drift, together=use).covariance))
+    if (np.abs(found.change) > MAX_DRIFTS * expected)[found.determined].any():
+        raise SessionError(
+            f"{session.name}: {found.moves}, far beyond the drift of {100 * expected.max():.0f} % that is expected; "
+            f"check the units and gains of force and pressures, expect more drift (--drift, GainDrift), {anyway}"
+        )
 
 
 def _drift_of_log(evidence: AbstractEvidence | None) -> GainDrift | None:
