@@ -311,12 +311,13 @@ def render_table(evaluation: Evaluation, title: str) -> str:
 
 def _force_lines(evaluation: Evaluation) -> list[str]:
     """One row per method: evenness, and errors of the total force."""
-    out = ["  total force                       CV    (+- SE)   RMSE, N  % of largest  mean abs., N  worst, N"]
+    width = max(28, *(len(row[0]) + 1 for row in evaluation.by_method()))
+    out = [f"  {'total force':<{width}}      CV    (+- SE)   RMSE, N  % of largest  mean abs., N  worst, N"]
     for label, cv, error, *errors in evaluation.by_method():
         spread = " " * 15 if np.isnan(cv) else f"{cv:6.3f}  {_bracketed(error, '.3f')}"
         shown = ["" if np.isnan(e) else f"{e:.2f}" for e in errors]
-        numbers = "".join(f"{text:>{width}}" for text, width in zip(shown, (10, 14, 14, 10), strict=True))
-        out.append(f"    {label:<28}{spread}{numbers}")
+        numbers = "".join(f"{text:>{size}}" for text, size in zip(shown, (10, 14, 14, 10), strict=True))
+        out.append(f"    {label:<{width}}{spread}{numbers}")
     return out + _coverage_lines(evaluation.summary())
 
 

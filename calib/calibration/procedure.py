@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 import jaxeit as je
+from jaxeit.messages.kinds import listed
 
 from ..check.acceptance import accept
 from ..fitting.cross_validation.neighbourhoods import with_error_scale
@@ -258,7 +259,7 @@ def _not_predicted(skin: je.Skin, pad_force: np.ndarray) -> tuple[str, ...]:
     lost = ~np.isfinite(pad_force)
     if not lost.any():
         return ()
-    pads = ", ".join(pad.name for pad, some in zip(skin.pads, lost.any(0), strict=True) if some)
+    pads = listed(pad.name for pad, some in zip(skin.pads, lost.any(0), strict=True) if some)
     return (
         f"{lost.any(1).sum()} of {len(lost)} presses have no held-out force, so that errors of forces are not known: "
         f"the curves of {pads} could not be fitted without the places of these presses; press these pads at more "

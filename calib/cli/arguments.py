@@ -158,6 +158,8 @@ def prepare_outputs(args: argparse.Namespace, *names: str) -> None:
     Raises:
         ValueError: if a file cannot be written, is given twice, or would take the place of an input or of a session.
     """
+    if any(getattr(args, name) == "" for name in names):
+        raise ValueError("the name of an output is empty; give a file name")
     outputs = [Path(path) for name in names if (path := getattr(args, name))]
     inputs = [Path(word) for name, value in vars(args).items() if name not in names for word in _words(value)]
     for number, path in enumerate(outputs):

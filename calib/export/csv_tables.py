@@ -99,7 +99,7 @@ def _log_table(archive: ArchiveReader, progress: Progress) -> Iterator[Row]:
 
 def _pad_table(archive: ArchiveReader, progress: Progress) -> Iterator[Row]:
     _require(archive, ["pad_names", *PAD_COLUMNS])
-    pads = [str(name) for name in archive.arrays["pad_names"].read().tolist()]
+    pads = [printable(name) for name in archive.arrays["pad_names"].read().tolist()]  # a line break splits rows
     yield [*PAD_HEAD, *(f"{pad} {label}" for pad in pads for label in PAD_COLUMNS.values())]
     for time, *columns in _blocks(archive, ["time", *PAD_COLUMNS], progress):
         each = [_cells(column[:, pad]) for pad in range(len(pads)) for column in columns]

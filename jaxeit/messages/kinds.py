@@ -1,12 +1,12 @@
 """What stands in the place of something else: a name, a path, a class, or an object of another kind."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
-__all__ = ["is_number", "require_kind", "require_unmasked", "shown", "stated"]
+__all__ = ["is_number", "listed", "require_kind", "require_unmasked", "shown", "stated"]
 
 
 def stated(value: Any) -> str:
@@ -24,6 +24,12 @@ def is_number(value: Any) -> bool:
 def shown(value: Any) -> str:
     """A wrong number as a message shows it: a text in quotes, which looks like a number otherwise."""
     return str(value) if is_number(value) else repr(value)
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names with commas between them; in quotes if one of them holds a comma, so that none looks like two."""
+    known = list(names)
+    return ", ".join(map(repr, known) if any("," in name for name in known) else known)
 
 
 def require_kind(

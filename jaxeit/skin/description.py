@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from ..budget import require
 from ..geometry.shapes import Disc, Domain, Polygon, Rectangle
 from ..geometry.surfaces import AbstractSurface, Cylinder, Sphere, SurfaceError
-from ..messages.kinds import require_kind, stated
+from ..messages.kinds import listed, require_kind, stated
 from ..notebook import Drawing, card
 from ..registry import RegistryError
 from ..toml import TomlError, TomlTable, parse_toml, read_text
@@ -180,7 +180,7 @@ class Skin:
             ("surface", "flat" if self.surface is None else type(self.surface).__name__.lower()),
             ("electrodes", ", ".join(f"{count} of kind {kind}" for kind, count in kinds.items())),
             ("readings", f"{self.protocol.readings} in {1e3 * self.protocol.frame_time:.3g} ms"),
-            ("pads", ", ".join(pad.name for pad in self.pads) or "none"),
+            ("pads", listed(pad.name for pad in self.pads) or "none"),
         ]
         label = f"Sheet with {len(self.electrodes)} electrodes and {len(self.pads)} pads"
         return card(f"Skin {self.name}", rows, self.drawing.svg(label))

@@ -559,6 +559,17 @@ def test_another_skin_is_refused(grid, skin):
         calib.calibrate([session], other)
 
 
+def test_columns_of_errors_stand_below_their_heads_whatever_the_recipe_is_called(calibration):
+    long = replace(calibration.evaluation, recipe="affine-play, tensor-product-splines")
+    lines = render_table(long, "t").splitlines()
+    start = next(i for i, line in enumerate(lines) if line.startswith("  total force"))
+    rows = [line for line in lines[start + 1 :] if line[4:5].strip() and not line.strip().startswith("in their")]
+    named = [line for line in rows if re.search(r"\d\.\d{3}  \(", line)]
+    assert len(named) > 2
+    assert any("tensor-product-splines" in line for line in named)
+    assert {re.search(r"\d\.\d{3}  \(", line).start() + 5 for line in named} == {lines[start].index("CV") + 2}
+
+
 def test_a_skin_of_the_same_scan_and_of_other_pads_is_told_apart(calibration, grid, skin, folder):
     """A mirrored skin has as many readings and pads: each number is well formed, and belongs elsewhere."""
     text = skin.toml.replace("[0.0, 0.0, 0.1, 0.1]", "[0.0, 0.0, 0.1, 0.09]")

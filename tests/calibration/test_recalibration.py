@@ -103,6 +103,13 @@ def test_a_large_drift_that_is_expected_is_no_wrong_unit(calibration, later, tmp
     np.testing.assert_allclose(found.log_gain, np.log(1.8 * GAINS), atol=0.06)
 
 
+def test_names_of_pads_split_no_row_of_the_table(moved):
+    odd = replace(moved.recalibration, pads=("line\nbreak", "tab\tx", "a\x1b[31m", "b"))
+    usual = render(replace(moved.recalibration, pads=("line?break", "tab?x", "a?[31m", "b")))
+    assert render(odd) == usual
+    assert len(odd.summary().splitlines()) == 1
+
+
 def test_levels_at_rest_are_told_and_taken_off(moved):
     found = moved.recalibration
     np.testing.assert_allclose(found.offset_change, OFFSET, atol=2)

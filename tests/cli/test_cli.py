@@ -1,6 +1,7 @@
 """The command line: what it prints, how it exits, and one clear line for every wrong input."""
 
 import argparse
+import html
 import json
 import re
 import shutil
@@ -20,6 +21,7 @@ from calib.cli.commands.calibrations import live_command
 from calib.cli.terminal import say
 from calib.presses import Processing
 from calib.session import Session
+from jaxeit import load_skin
 from jaxeit.contacts import LoadSettings
 from jaxeit.tracking import TrackerSettings
 
@@ -223,6 +225,20 @@ def test_names_reach_the_terminal_without_control_characters(tmp_path, skin, cap
     assert "--al??: not known" in capsys.readouterr().err
     say("a skin\nb\x1b\u202e")
     assert capsys.readouterr().err == "jaxeit: a skin b??\n"
+
+
+def test_a_comma_in_the_name_of_a_pad_does_not_look_like_two_pads(tmp_path, skin, capsys):
+    path = tmp_path / "mine.toml"
+    path.write_text(skin.toml.replace('"lower left"', '"left, lower"', 1))
+    assert main(["check", str(path)]) == 0
+    assert "pads: 'left, lower', 'lower right', 'upper left', 'upper right'" in capsys.readouterr().out
+    page = html.unescape(load_skin(path)._repr_html_())
+    assert "'left, lower', 'lower right', 'upper left', 'upper right'" in page
+
+
+def test_the_empty_name_of_an_output_is_refused_before_the_work(capsys):
+    assert main(["apply", "nowhere.h5", "nothing.h5", "-o", ""]) == 2
+    assert "the name of an output is empty; give a file name" in capsys.readouterr().err
 
 
 def test_a_full_disk_says_what_to_do_where_no_file_is_known():

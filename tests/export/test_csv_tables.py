@@ -61,6 +61,14 @@ def test_forces_and_contacts_of_each_frame(tmp_path, monkeypatch, capsys, block)
     np.testing.assert_array_equal(columns[4], [7, np.nan, np.nan])
 
 
+def test_a_line_break_in_the_name_of_a_pad_splits_no_head(tmp_path):
+    archive(tmp_path / "map.h5", pad_names=np.array(["left\nlower", "right\ttop"]))
+    calib.export_csv(tmp_path / "map.h5", tmp_path / "f.csv")
+    lines = (tmp_path / "f.csv").read_text().splitlines()
+    assert len(lines) == FRAMES + 1
+    assert lines[0].startswith("time_s,total_N,left?lower force_N,")
+
+
 def test_contacts_that_are_followed_keep_their_numbers(tmp_path):
     rng = np.random.default_rng(1)
     tracks = {"tracks/time": np.array([0, 0, 1]), "tracks/number": np.array([3, 4, 3])}

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import jaxeit as je
+from jaxeit.messages.kinds import listed
 
 from ...check.acceptance import accept
 from ...check.placement import placement_note
@@ -154,7 +155,7 @@ def _coordinates(calibration: Calibration) -> tuple[dict[str, int], dict[str, _C
     contacts = 0 if calibration.locator is None else calibration.locator.contacts
     about = {
         "pixel": (len(centres), "number of the pixel, row by row"),
-        "pad": (len(pads), "number of the pad: " + ", ".join(f"{i} {pad.name}" for i, pad in enumerate(pads))),
+        "pad": (len(pads), "number of the pad: " + listed(f"{i} {pad.name}" for i, pad in enumerate(pads))),
         "axis": (2, "0: x, 1: y"),
         "space": (3, "0: x, 1: y, 2: z"),
         "contact": (contacts, "number of the contact in its frame"),

@@ -11,8 +11,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jaxeit.messages.kinds import listed
+
 from ...fitting.gain_update import relative_covariance
 from ...fitting.pad_gains import PadGains
+from ...session.errors import printable
 
 NOTICEABLE_CHANGE = 0.02  # change of a gain below which a recalibration is not worth it
 # Of a change over its standard error: the largest move of several pads is looked at, and while live again and again.
@@ -150,8 +153,8 @@ class Recalibration:
             return "the gains of the pads"
         change, error = 100 * np.expm1(self.change[known]), 100 * float(self.change_error[known].max())
         low, high = int(np.argmin(change)), int(np.argmax(change))
-        spans = f"{change[low]:+.1f} % ({self.pads[known[low]]})"
-        spans += "" if low == high else f" to {change[high]:+.1f} % ({self.pads[known[high]]})"
+        spans = f"{change[low]:+.1f} % ({printable(self.pads[known[low]])})"
+        spans += "" if low == high else f" to {change[high]:+.1f} % ({printable(self.pads[known[high]])})"
         against = "" if self.evidence is Evidence.KNOWN_FORCE else " relative to each other"
         return f"pads read {spans}{against}, +- {error:.1f} %"
 
@@ -201,7 +204,9 @@ class Recalibration:
 
     def summary(self) -> str:
         """One line for the provenance of the calibration."""
-        gains = ", ".join(f"{name} {g:.4f}" for name, g in zip(self.pads, np.exp(self.log_gain), strict=True))
+        gains = listed(
+            f"{printable(pad)} {gain:.4f}" for pad, gain in zip(self.pads, np.exp(self.log_gain), strict=True)
+        )
         return f"{self.session}: {self.evidence}, recorded {self.until}: gains {gains}"
 
     # --- for the calibration file ------------------------------------------------------------------------------
@@ -266,7 +271,7 @@ def render(found: Recalibration) -> str:
 def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
     words = "significant" if row["significant"] else "" if row["determined"] else "not determined"
     return (
-        row["pad"],
+        printable(row["pad"]),
         _number(row["offset_pa"], ".1f"),
         _number(row["offset_change_pa"], "+.1f"),
         _number(row["drift_pa_per_hour"], "+.2g"),

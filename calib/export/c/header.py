@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 import jaxeit as je
+from jaxeit.messages.kinds import listed
 
 from ...calibration import Calibration, LogCalibration
 from ...calibration.argument_checks import require_calibration
@@ -252,7 +253,7 @@ def _about(calibration: Calibration, numbers: Numbers, sizes: HeaderSizes, remar
     """The comment of the header, and its sizes as macros."""
     (pixels, pairs), readings, pads = numbers.factor.shape, len(numbers.weight), len(numbers.unmix)
     rows, columns = calibration.recon.shape
-    names = ", ".join(pad.name for pad in calibration.skin.pads)
+    names = listed(pad.name for pad in calibration.skin.pads)
     sessions = calibration.provenance.get("sessions", "").splitlines()
     lines = [
         f"One frame of the skin {calibration.skin.name!r} to image, force map and pad forces, in float32.",

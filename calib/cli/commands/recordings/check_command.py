@@ -65,6 +65,7 @@ def _described(path: str) -> str:
     import numpy as np
 
     import jaxeit as je
+    from jaxeit.messages.kinds import listed
 
     from ....check.skin import skin_findings, voltage_findings
     from ....check.text import findings_text
@@ -78,7 +79,7 @@ def _described(path: str) -> str:
     readings = 1e3 * np.abs(je.forward(model))  # mV
     low, high = skin.domain.bounds
     width, height = (1e3 * (end - start) for start, end in zip(low, high, strict=True))
-    pads = ", ".join(printable(pad.name) for pad in skin.pads) or "none"
+    pads = listed(printable(pad.name) for pad in skin.pads) or "none"
     doubts = "\n".join(findings_text([*skin_findings(skin), *voltage_findings(1e-3 * readings)]))
     return (
         f"{printable(path, 300)}: skin {printable(skin.name)}, {width:.4g} x {height:.4g} mm\n"
