@@ -112,25 +112,39 @@ def _flat(value: object, key: str = "") -> dict[str, object]:
     return {k: v for name, part in items for k, v in _flat(part, name).items()}
 
 
+def electrode_pitch(skin: je.Skin) -> float:
+    """Median distance of the electrodes from their nearest neighbours, m; infinite for one electrode."""
+    electrodes = np.asarray(skin.electrode_positions)[:, :2]
+    between = np.linalg.norm(electrodes[:, None] - electrodes, axis=-1)
+    np.fill_diagonal(between, np.inf)
+    return float(np.median(between.min(1)))
+
+
+def beyond_electrodes(skin: je.Skin, points: np.ndarray) -> np.ndarray:
+    """Which points (n, 2) m lie more than the distance between two electrodes outside of all: EIT tells no place there.
+
+    None where all electrodes lie on a line.
+    """
+    try:
+        hull = ConvexHull(np.asarray(skin.electrode_positions)[:, :2]).equations
+    except QhullError:
+        return np.zeros(len(points), bool)
+    return np.asarray((points @ hull[:, :2].T + hull[:, 2]).max(1) > electrode_pitch(skin))
+
+
 def _size_findings(skin: je.Skin) -> Iterator[Finding]:
     """A sheet or a pad that reaches far beyond the electrodes: their positions have a typo, or another unit."""
     electrodes = np.asarray(skin.electrode_positions)[:, :2]
     rim = _rim_points(skin.domain)
-    between = np.linalg.norm(electrodes[:, None] - electrodes, axis=-1)
-    np.fill_diagonal(between, np.inf)
-    pitch = float(np.median(between.min(1)))
+    pitch = electrode_pitch(skin)
     if not np.isfinite(pitch):
         return
     beyond = float(np.linalg.norm(rim[:, None] - electrodes, axis=-1).min(1).max())
     if beyond > MAX_RIM_PITCHES * pitch:
         what = f"the sheet reaches {beyond:.3g} m beyond its electrodes, which are {pitch:.3g} m apart"
         yield Finding(Severity.WARNING, "/device", what, "correct the size of the sheet or the positions of electrodes")
-    try:
-        hull = ConvexHull(electrodes).equations
-    except QhullError:  # all electrodes lie on a line
-        return
     for pad in skin.pads:
-        share = _share_beyond(pad, hull, pitch)
+        share = float(beyond_electrodes(skin, _points_in(pad.polygon)).mean())
         if share > MAX_PAD_BEYOND:
             what = (
                 f"{100 * share:.0f} % of pad {pad.name!r} lies more than {pitch:.3g} m, the distance between two "
@@ -162,12 +176,6 @@ def _cover_findings(skin: je.Skin) -> Iterator[Finding]:
     if cover < MIN_COVER:
         what = f"pads lie under {100 * cover:.0f} % of the sheet; no pad tells the forces of contacts elsewhere"
         yield Finding(Severity.OK, "/device", what, "press on pads to calibrate: presses beside them are left out")
-
-
-def _share_beyond(pad: je.Pad, hull: np.ndarray, pitch: float) -> float:
-    """Share of a pad that lies more than a pitch outside of a hull, given by `ConvexHull.equations`."""
-    points = _points_in(pad.polygon)
-    return float(np.mean((points @ hull[:, :2].T + hull[:, 2]).max(1) > pitch))
 
 
 def _points_in(shape: je.geometry.Domain) -> np.ndarray:

@@ -62,22 +62,35 @@ def test_a_shipped_scene_is_not_accused(name, transfers, tmp_path):
     assert report.ok, [f for f in report.findings if f.severity is Severity.ERROR]
 
 
-def test_presses_that_eit_hardly_sees_are_not_those_of_another_time(tmp_path):
-    """Nine presses of varied force, most far from the electrodes, resemble the presses next to them by chance."""
-    text = (
-        je.load_skin("testbed")
-        .toml.replace("pitch = 0.04", "pitch = 0.025")
-        .replace("columns = 5", "columns = 4")
-        .replace("rows = 5", "rows = 4")
-    )
-    skin = je.skin.parse_skin(text.replace("origin = [0.02, 0.02]", "origin = [0.0625, 0.0625]"))
-    sites = np.random.default_rng(6).uniform(0.012, 0.188, (9, 2)).round(4)
+@pytest.fixture(scope="module")
+def middle():
+    """A testbed whose electrodes are in its middle, and reach less than half of the sheet."""
+    text = je.load_skin("testbed").toml.replace("pitch = 0.04", "pitch = 0.025")
+    text = text.replace("columns = 5", "columns = 4").replace("rows = 5", "rows = 4")
+    return je.skin.parse_skin(text.replace("origin = [0.02, 0.02]", "origin = [0.0625, 0.0625]"))
+
+
+def checked(skin, sites, forces, folder):
+    """The report on presses at ``sites`` (presses, 2) m with ``forces`` in turn, N."""
     bench = sixteen_presses(skin, blank=3.0, pad_rate=100.0)
-    bench = dataclasses.replace(bench, sites=sites, forces=np.array([3.0, 6.0, 10.0]))
-    path = simulate(bench, tmp_path / "s.h5", fidelity=je.Fidelity.draft(edge_length=0.05))
+    bench = dataclasses.replace(bench, sites=np.asarray(sites), forces=np.asarray(forces))
+    path = simulate(bench, folder / "s.h5", fidelity=je.Fidelity.draft(edge_length=0.05))
     with open_session(path) as session:
-        report = check_session(session)
+        return check_session(session)
+
+
+def test_presses_that_eit_hardly_sees_are_not_those_of_another_time(middle, tmp_path):
+    """Nine presses of varied force, most far from the electrodes, resemble the presses next to them by chance."""
+    sites = np.random.default_rng(6).uniform(0.012, 0.188, (9, 2)).round(4)
+    report = checked(middle, sites, [3.0, 6.0, 10.0], tmp_path)
     assert report.ok, report.findings
+
+
+def test_places_beyond_the_electrodes_are_not_compared(middle, tmp_path):
+    """EIT sees these presses, and places them nearer to the electrodes than they are."""
+    x, y = np.meshgrid([0.013, 0.1, 0.187], [0.013, 0.07, 0.13, 0.187])
+    report = checked(middle, np.stack([x.ravel(), y.ravel()], 1), [20.0], tmp_path)
+    assert not [f for f in report.findings if "places" in f.what and f.severity > Severity.OK], report.findings
 
 
 def real(name):

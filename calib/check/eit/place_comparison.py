@@ -13,6 +13,7 @@ from ...session.units import SECOND
 from ..evidence import PressEvidence
 from ..parts import MIN_ROWS, RowRange, flagged_part
 from ..report import ChannelTable, Finding, Severity, listed
+from ..skin import beyond_electrodes, electrode_pitch
 from .contact_places import locate_contacts
 from .contradictions import MIN_CONTRADICTION
 from .place_fits import place_fit, spread_text
@@ -41,13 +42,15 @@ def contact_findings(evidence: PressEvidence, skin: je.Skin, channels: ChannelTa
     if part is not None:
         yield _sign_finding(part.text(evidence.times[evidence.seen[rows]], int(eit.time[0])))
         return
-    rows, contacts, alike = rows[usual], contacts[usual], np.abs(alike[usual])
+    sites = evidence.site[evidence.seen[rows]]
+    told = usual & ~(skin.domain.contains(sites) & beyond_electrodes(skin, sites))
+    rows, contacts, alike = rows[told], contacts[told], np.abs(alike[told])
     # The fields in closed form do not hold for all sheets, such as one with a corner that points inwards.
     clear = len(alike) > 0 and bool(np.median(alike) > CLEARLY_ALIKE)
     few = len(np.unique(contacts.round(4), axis=0)) < MIN_PLACES
     if few or (contacts.std(0) < MIN_SPREAD * np.ptp(bounds, axis=0)).any():
         return
-    numbers, pitch = evidence.seen[rows], _pitch(skin)
+    numbers, pitch = evidence.seen[rows], electrode_pitch(skin)
     site = evidence.site[numbers]
     away = np.linalg.norm(contacts - site, axis=1)
     if np.median(away) > MAX_AWAY * pitch or np.mean(away > MAX_FEW * pitch) > MAX_OTHERS:
@@ -88,14 +91,6 @@ def _located(
     contacts, alike = locate_contacts(change[known], channels.pattern, skin, channels.mixing)
     good = np.abs(alike) > MIN_ALIKE
     return known[good], contacts[good], alike[good]
-
-
-def _pitch(skin: je.Skin) -> float:
-    """Median distance of the electrodes from their nearest neighbours, m."""
-    electrodes = np.asarray(skin.electrode_positions)[:, :2]
-    between = np.linalg.norm(electrodes[:, None] - electrodes, axis=-1)
-    np.fill_diagonal(between, np.inf)
-    return float(np.median(between.min(1)))
 
 
 def _moves(middle: np.ndarray) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
