@@ -65,8 +65,11 @@ BOX_POINTS = 40  # along each side of a box that is examined
 
 
 def _require_apart(pads: Sequence[Pad]) -> None:
-    """Refuse pads of one name, and one that lies on another. Pads that overlap in part share the force there."""
-    names = [pad.name for pad in pads]
+    """Refuse pads of one name, and one that lies on another. Pads that overlap in part share the force there.
+
+    Names that differ in spaces alone look the same in tables, and in their heads.
+    """
+    names = [" ".join(pad.name.split()) for pad in pads]
     if again := [name for name, number in Counter(names).items() if number > 1]:
         raise SkinError(f"{names.count(again[0])} pads have the name {again[0]!r}; give each pad its own")
     for first, second in combinations(pads, 2):

@@ -88,6 +88,7 @@ def test_a_copied_and_edited_file(tmp_path):
         ("[0.0, 0.0, 0.1, 0.1]", "[0.0, 0.0, 1e-5, 0.1]", "is 1e-05 m wide, too little for a pad of this sheet"),
         ("[0.0, 0.0, 0.1, 0.1]", "[0.1, 0.1, 0.2, 0.2]", "100 % of pad 'lower left' or 'upper right' lie within the o"),
         ('name = "lower left"', 'name = "lower right"', "2 pads have the name 'lower right'; give each pad its own"),
+        ('name = "lower left"', 'name = " lower  right"', "2 pads have the name 'lower right'; give each pad its own"),
         ('name = "lower left"', 'name = " "', r"\[\[pads\]\] number 1: name: is ' '; give the pad's name"),
         ("[sheet]", "[sheet", "not valid TOML"),
         ("maximum = 34474.0", "maximum = -1.0", r"\[pressure_sensor\]: maximum"),

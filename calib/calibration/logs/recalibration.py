@@ -1,5 +1,6 @@
 """Recalibration of a log's calibration from a log with known force; see `shift`."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ from ...fitting.gain_update import GainDrift
 from ...fitting.logs import series_of
 from ...session import Session, SessionError
 from ..fitted_sessions import SAME_NOTE, is_fitted, require_not_moved_by
+from ..recalibration.changes import ANYWAY, MAX_DRIFTS, beyond_drift
 from .calibration import LogCalibration
 from .procedure import log_of, place_of, stream_of
 from .shift import LogShift, fit_shift, full_scale_of, shift_prior
@@ -72,7 +74,8 @@ def recalibrate_log(
 
     Raises:
         SessionError: if a stream is missing, the sensor is another, the log does not determine the gain, or
-            has moved the calibration before; also with ignored errors, if the sensor does not follow the force.
+            has moved the calibration before, or the gain has moved by more than three standard deviations of what
+            may have drifted; also with ignored errors, if the sensor does not follow the force.
         RecordingError: if `check_session` finds an error in the session, unless errors are ignored.
 
     Example:
@@ -83,13 +86,16 @@ def recalibrate_log(
     require_not_moved_by(calibration.provenance, session)
     found = assess_log(calibration, session, drift, ignore_errors=ignore_errors)
     if not found.determined and not ignore_errors:
-        raise SessionError(f"{session.name}: {found.health}; or move it all the same (--force, ignore_errors=True)")
+        raise SessionError(f"{session.name}: {found.health}; {ANYWAY}")
     if not found.follows:
         raise SessionError(
             f"{session.name}: /streams/{calibration.stream}: does not follow the force: by the calibration it reads "
             f"{found.gain:.3g} N +- {found.errors[0]:.2g} N per newton; check the sensor, its tube and the order of "
             "the columns at import, and calibrate again if they are right"
         )
+    spread = math.sqrt(shift_prior(calibration.shift, found.full_scale, drift or GainDrift())[1][0, 0])
+    if not ignore_errors and abs(math.log(found.gain / found.before[0])) > MAX_DRIFTS * spread:
+        raise SessionError(f"{session.name}: {found.moves}, {beyond_drift(spread)}; {ANYWAY}")
     history = [calibration.provenance.get("recalibrations", ""), found.summary()]
     return replace(
         calibration,

@@ -92,11 +92,15 @@ class LogShift:
     @property
     def health(self) -> str:
         """How far off the calibration was, since when, and what to do, in one line."""
+        days = days_between(self.since, self.until)
+        return health_line(self.since, self.until, days, self.moves if self.determined else "the sensor", self.advice)
+
+    @property
+    def moves(self) -> str:
+        """How far gain and offset have moved, in words."""
         change, (gain, offset) = 100 * (self.gain / self.before[0] - 1), self.errors
         moves = f"the sensor reads {change:+.1f} % +- {100 * gain / self.before[0]:.1f} %"
-        moves += f" and {self.offset - self.before[1]:+.2g} N +- {offset:.2g} N without force"
-        days = days_between(self.since, self.until)
-        return health_line(self.since, self.until, days, moves if self.determined else "the sensor", self.advice)
+        return f"{moves} and {self.offset - self.before[1]:+.2g} N +- {offset:.2g} N without force"
 
     def applied(self, found: LogPrediction, multiple: float) -> LogPrediction:
         """Forces of the calibration with gain and offset taken off; `multiple`: half the interval in deviations."""

@@ -20,6 +20,8 @@ from ...session.errors import printable
 NOTICEABLE_CHANGE = 0.02  # change of a gain below which a recalibration is not worth it
 # Of a change over its standard error: the largest move of several pads is looked at, and while live again and again.
 SIGNIFICANT_RATIO = 3.0
+MAX_DRIFTS = 3.0  # standard deviations of what may have drifted, beyond which a unit or a pad is wrong
+ANYWAY = "or move it all the same (--force, ignore_errors=True)"
 LARGE_MISFIT = 2.0  # residuals over the stated ones: a gain does not explain the readings
 
 
@@ -56,6 +58,12 @@ def health_line(since: str, until: str, days: float, moves: str, advice: Advice)
     when = f"{_day(until)} against {_day(since)}"
     when += f" ({days:.1f} days)" if math.isfinite(days) and days > 0 else ""
     return f"calibration health, {when}: {moves}: {advice}"
+
+
+def beyond_drift(expected: float) -> str:
+    """Words for a move of more than `MAX_DRIFTS` times what may have drifted, a part of the gain."""
+    todo = "check the units and gains of force and pressures, or expect more drift (--drift, GainDrift)"
+    return f"far beyond the drift of {100 * expected:.0f} % that is expected; {todo}"
 
 
 @dataclass(frozen=True, eq=False)

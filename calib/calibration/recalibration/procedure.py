@@ -18,7 +18,7 @@ from ..calibration import Calibration
 from ..fitted_sessions import SAME_NOTE, holds_presses, is_fitted, require_not_moved_by
 from ..logs.calibration import LogCalibration
 from ..logs.recalibration import recalibrate_log
-from .changes import Evidence, Recalibration
+from .changes import ANYWAY, MAX_DRIFTS, Evidence, Recalibration, beyond_drift
 from .evidence import AbstractEvidence, KnownForces, OrdinaryUse, gain_prior
 from .loads import LoadedPads, expected_forces
 from .press_noise import PressNoise, press_noise
@@ -29,7 +29,6 @@ C = TypeVar("C", Calibration, LogCalibration)
 
 MIN_PRESSES = 3  # of a session that can be used; fewer are refused
 BEYOND = 0.3  # of the calibrated range of pressure, by which the pads may read more than was calibrated
-MAX_DRIFTS = 3.0  # standard deviations of what may have drifted, beyond which a unit or a pad is wrong
 MIN_SHARE = 0.02  # of a press; a pad with less of it counts as not loaded
 
 
@@ -81,17 +80,13 @@ def _require_plausible(
     found: Recalibration, calibration: Calibration, evidence: AbstractEvidence | None, session: Session
 ) -> None:
     """Refuse a session that determines no gain, and gains that have moved beyond all drift, as by a wrong unit."""
-    anyway = "or move it all the same (--force, ignore_errors=True)"
     if not found.determined.any():
-        raise SessionError(f"{session.name}: {found.health}; {anyway}")
+        raise SessionError(f"{session.name}: {found.health}; {ANYWAY}")
     drift = GainDrift() if evidence is None else evidence.drift
     use = found.evidence is Evidence.ORDINARY_USE
     expected = np.sqrt(np.diag(gain_prior(calibration, drift, together=use).covariance))
     if (np.abs(found.change) > MAX_DRIFTS * expected)[found.determined].any():
-        raise SessionError(
-            f"{session.name}: {found.moves}, far beyond the drift of {100 * expected.max():.0f} % that is expected; "
-            f"check the units and gains of force and pressures, expect more drift (--drift, GainDrift), {anyway}"
-        )
+        raise SessionError(f"{session.name}: {found.moves}, {beyond_drift(float(expected.max()))}; {ANYWAY}")
 
 
 def _drift_of_log(evidence: AbstractEvidence | None) -> GainDrift | None:

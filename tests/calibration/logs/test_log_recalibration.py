@@ -54,6 +54,15 @@ def errors(calibration, path):
         return evaluate_log(calibration, session).summary()
 
 
+def test_a_force_in_kg_moves_no_calibration(made, tmp_path):
+    force, values = log(3)
+    with open_session(write_log(tmp_path / "kg.h5", force / 9.80665, values)) as session:
+        with pytest.raises(SessionError, match=r"far beyond the drift of 14 %.*check the units"):
+            recalibrate_log(made[0], session)
+        shift = recalibrate_log(made[0], session, ignore_errors=True).shift
+    assert shift.gain == pytest.approx(9.80665, rel=0.02)
+
+
 def test_gain_and_offset_are_found_and_taken_off(made):
     calibration, _, later, other = made
     with open_session(later) as session:
