@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         say(f"{OUT_OF_MEMORY} ({one_line(error)[:200]})")
         return 2
     except KeyboardInterrupt as interrupt:
-        return say_interrupted(interrupt, "nothing was written")
+        return say_interrupted(interrupt, "; ".join(getattr(interrupt, "__notes__", ["nothing was written"])))
 
 
 OUT_OF_MEMORY = "this machine has too little memory for it; use less data, a coarser fidelity or fewer pixels"

@@ -37,6 +37,16 @@ def say_interrupted(interrupt: KeyboardInterrupt, what: str) -> int:
     return interruption_status(interrupt)
 
 
+@contextmanager
+def after_writing(output: str) -> Iterator[None]:
+    """Within this context an interruption says that ``output`` is written, as its note."""
+    try:
+        yield
+    except KeyboardInterrupt as interrupt:
+        interrupt.add_note(f"{output} is written")
+        raise
+
+
 def one_line(error: Exception) -> str:
     """The message of an error, on one line."""
     return plain(" ".join(str(error).split())) or type(error).__name__

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from calib.cli import main
+from calib.cli.terminal import after_writing
 from calib.live.views import presentation
 from calib.session import outputs
 from tests.record.test_full_disk import SCENE
@@ -143,6 +144,17 @@ def test_an_interruption_within_a_collection_of_garbage_ends_the_command(number,
 
     monkeypatch.setattr("calib.cli.commands.skins.doctor_command.run", run)
     assert main(["doctor"]) == status
+
+
+def test_an_interruption_after_the_output_says_that_it_is_written(monkeypatch, capsys):
+    def run(args):
+        with after_writing("c.h5"):
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(60)  # cut short
+
+    monkeypatch.setattr("calib.cli.commands.skins.doctor_command.run", run)
+    assert main(["doctor"]) == 143
+    assert capsys.readouterr().err == "jaxeit: ended by SIGTERM; c.h5 is written\n"
 
 
 LEAVING = """

@@ -16,7 +16,7 @@ from ...arguments import (
     tracking_of,
 )
 from ...recipe_options import add_correction_arguments, processing_of, refuse_corrections
-from ...terminal import progress_bar, show
+from ...terminal import after_writing, progress_bar, show
 
 if TYPE_CHECKING:
     from ....calibration import LogCalibration
@@ -82,7 +82,8 @@ def run(args: argparse.Namespace) -> int:
     if args.report is not None:
         from ....report.track_report import write_track_report
 
-        write_track_report(args.report, args.output, calibration.skin)
+        with after_writing(args.output):
+            write_track_report(args.report, args.output, calibration.skin)
     show(f"{args.output}: {frames} force maps in newtons")
     return 0
 

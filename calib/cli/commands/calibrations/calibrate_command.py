@@ -15,7 +15,7 @@ from ....session import Session
 from ...arguments import count, prepare_results, require_matplotlib_for, skin_of
 from ...recipe_options import IMAGING, add_recipe_arguments, recipe_of
 from ...results import render_calibration, render_found
-from ...terminal import announce_model, say_interrupted, show, stage_bar, title
+from ...terminal import after_writing, announce_model, say_interrupted, show, stage_bar, title
 
 if TYPE_CHECKING:
     from jaxeit.skin import Skin
@@ -77,7 +77,8 @@ def _calibrate_together(args: argparse.Namespace) -> int:
     if args.report:
         from ....report.document import write_report
 
-        write_report(calibration, Path(args.report), evaluations=tried)
+        with after_writing(args.output):
+            write_report(calibration, Path(args.report), evaluations=tried)
     if args.json:
         own = calibration.evaluation.summary() | {"notes": list(calibration.notes)}
         results = {"calibration": own} | {name: found.summary() for name, found in tried.items()}
