@@ -25,7 +25,7 @@ from ..fitting.response import (
     require_every_pad_pressed,
 )
 from ..presses.contradictions import drifting_pads, outlying_presses, place_errors
-from ..presses.pooled import PooledPresses, pool_presses
+from ..presses.pooled import MEANS_PER_PRESS, PooledPresses, PressSeries, block_means, pool_presses, press_series
 from ..presses.skins import differing_parts
 from ..presses.table import PressMeasurements, Processing, measure
 from ..session import Session, SessionError
@@ -353,7 +353,8 @@ def _evaluation(calibration: Calibration, session: Session, processing: Processi
     _require_channels(calibration, found)
     images = Imager(calibration.recon, calibration.masks, calibration.locator).presses(found.dv)
     agreement = agreement_of_presses(calibration, found, images)
-    force, half_width = agreement.calibration.pads.hold_forces(found.pressure, images.places)
+    along = block_means(press_series([found]), MEANS_PER_PRESS)
+    force, half_width = agreement.calibration.pads.hold_forces(found.pressure, images.places, along)
     return Evaluation(
         position=found.position,
         estimated=images.estimated,
@@ -365,7 +366,7 @@ def _evaluation(calibration: Calibration, session: Session, processing: Processi
         centre=centre_of(calibration.skin),
         held_out_by="" if fitted else "session",
         notes=(*([FITTED_NOTE] if fitted else []), *accepted.notes, *found.notes, *agreement.notes),
-        others=_compared_forces(calibration, found, images.integral),
+        others=_compared_forces(calibration, found, images.integral, along),
         recipe=calibration.evaluation.recipe,
     )
 
@@ -380,7 +381,7 @@ def _require_channels(calibration: Calibration, found: PressMeasurements) -> Non
 
 
 def _compared_forces(
-    calibration: Calibration, found: PressMeasurements, image_sum: np.ndarray
+    calibration: Calibration, found: PressMeasurements, image_sum: np.ndarray, along: PressSeries
 ) -> dict[str, np.ndarray]:
     """Total force by the methods of comparison, (presses,) N each; empty for a file of an early version."""
     if calibration.baseline is None:
@@ -389,5 +390,5 @@ def _compared_forces(
     others = {"eit": calibration.image_gain * image_sum, "hybrid": papers}
     if calibration.field is not None and "contact_position" in found.session.truth:
         true = single_places(found.position, len(calibration.skin.pads))
-        others["true_place"] = calibration.pad_forces(found.pressure, true)[0].sum(1)
+        others["true_place"] = calibration.pads.hold_forces(found.pressure, true, along)[0].sum(1)
     return others

@@ -17,6 +17,7 @@ from ..calibration.recipes.text import (
     AUTO,
     DEFAULT,
     FIDELITY_LEVELS,
+    MEMORYLESS,
     NONE,
     SWITCHES,
     curve_choice,
@@ -41,8 +42,11 @@ def add_recipe_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("recipe", about)
     text = "take the choices from a TOML file; options given beside it override the file"
     group.add_argument("--recipe", metavar="RECIPE.toml", help=text)
-    text = "curve of force against pressure; auto chooses it by cross-validation over places"
-    _choice(group, "--curve", (*CURVES, AUTO), text, default="linear")
+    text = (
+        "curve of force against pressure; auto chooses it by cross-validation over places, memoryless among those "
+        "without hysteresis alone, in less time"
+    )
+    _choice(group, "--curve", (*CURVES, AUTO, MEMORYLESS), text, default="linear")
     text = "correction by location: gain over the estimated place of the contact; the paper's recipe has none"
     _choice(group, "--location", (NONE, *FIELDS, AUTO), text, default=NONE)
     _choice(group, "--locator", LOCATORS, "estimator of the place of a contact", default="fitted-contact")

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 import jaxeit as je
 
 from ..presses.crosstalk import own_deviations, own_pressures
-from ..presses.pooled import PressData
+from ..presses.pooled import REST_FRACTION, PressData, PressSeries, with_holds
 from .curves.base import AbstractCurve
 from .curves.fit import fit_curves
 from .curves.fitted import FittedCurve, Prediction, predict_pads
@@ -34,13 +34,10 @@ from .intervals import NORMAL_MULTIPLE, NoiseLaw
 from .losses import AbstractLoss
 from .pad_gains import PadGains
 from .pad_predictions import PadPrediction, independent, with_gain
-from .results import FitResult
 
 ALTERNATIONS = 2  # of fits of the field and of the curves; more change the result by far less than the noise
 # Fraction of the largest force below which presses weigh less: their noise is constant, not proportional to the force.
 FAINT_FORCE = 0.05
-# Fraction of the largest fitted pressure below which the force of a curve that is not zero at rest falls to zero.
-REST_FRACTION = 0.05
 
 
 class LocatedPresses(NamedTuple):
@@ -141,7 +138,7 @@ class PadModel(eqx.Module):
     def predict(self, own: Float[Array, "n pads"], places: Places | None = None) -> PadPrediction:
         """Forces from the pads' own pressures (n, pads) Pa; pure. Without places the gain is one, and the standard
         error includes its variation over the pad."""
-        found = _curve_predictions(self.curves, own)
+        found = curve_predictions(self.curves, own)
         if self.field is None:
             return independent(found)
         gain = self.field.log_gain(nowhere(own) if places is None else places)
@@ -189,7 +186,7 @@ class PadModel(eqx.Module):
         return np.asarray(found.force), np.asarray(found.standard_error), np.asarray(found.valid)
 
     def hold_forces(
-        self, pressures: Float[ArrayLike, "n pads"], places: Places | None = None
+        self, pressures: Float[ArrayLike, "n pads"], places: Places | None = None, along: PressSeries | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Force on each pad (n, pads) N, and half the 90 % interval of their total (n,) N, of means over holds.
 
@@ -199,8 +196,16 @@ class PadModel(eqx.Module):
         Args:
             pressures: means over the holds of presses, (n, pads) Pa.
             places: as for `pad_forces`.
+            along: readings along the presses, on which the force of a curve with memory depends; default: each hold
+                follows the one before.
         """
-        found = by_rows(forces, np.asarray(pressures, self.dtype), places, before=(self,))
+        if along is None or not self.curves.curve.path:
+            found = by_rows(forces, np.asarray(pressures, self.dtype), places, before=(self,))
+        else:
+            series = with_holds(along, np.asarray(pressures))
+            at = None if places is None else jax.tree.map(lambda part: part[series.press], places)
+            found = by_rows(forces, np.asarray(series.pressure, self.dtype), at, before=(self,))
+            found = jax.tree.map(lambda part: part[series.hold], found)
         force, noise = np.asarray(found.force), self._noise if self.hold_noise is None else self.hold_noise
         return force, noise.half_widths(force, np.asarray(found.total_variance))
 
@@ -297,7 +302,7 @@ def _fit_gains(
 ) -> FittedField:
     """The field fitted to log forces over those of the curves, which were fitted with the log-gain `gain`."""
     data = presses.data
-    force = by_rows(_curve_forces, data.pressure, before=(curves,)) * np.exp(gain)
+    force = _hold_curve_forces(curves, data) * np.exp(gain)
     part = np.maximum(np.nan_to_num(force), 0)
     total = part.sum(1)
     use = use & (total > 0) & (data.force > 0)
@@ -311,50 +316,19 @@ def _fit_gains(
     return _fit_field(field, presses.geometry, places, y, x, w, jax.device_put(data.reach))
 
 
+def _hold_curve_forces(curves: FittedCurve, data: PressData) -> np.ndarray:
+    """Forces of the curves over the holds, (presses, pads) N; of curves with memory after the samples before them."""
+    if not curves.curve.path:
+        return np.asarray(by_rows(_curve_forces, data.pressure, before=(curves,)))
+    series = data.with_holds
+    return np.asarray(by_rows(_curve_forces, series.pressure, before=(curves,))[series.hold])
+
+
 def _press_weights(force: np.ndarray, place: np.ndarray, use: np.ndarray) -> np.ndarray:
     """Weights of the presses, (presses,): at most one for all at a place, and less for faint presses."""
     faint = FAINT_FORCE * force[use].max(initial=0)
     weight = force**2 / (force**2 + faint**2)
     return np.asarray(weight / np.maximum(np.bincount(place, use)[place], 1))
-
-
-class PadForces(NamedTuple):
-    """Predicted pad forces on the host, (n, pads) N, NaN without a fit; and the variance of their total by the model,
-    (n,) N^2."""
-
-    force: np.ndarray
-    total_variance: np.ndarray
-
-
-def predict_holds(model: PadModel, presses: LocatedPresses) -> PadForces:
-    """Pad forces over the holds of the presses, (presses, pads)."""
-    return _valid_forces(model, by_rows(predict, presses.data.pressure, presses.places, before=(model,)))
-
-
-def predict_samples(model: PadModel, presses: LocatedPresses) -> PadForces:
-    """Pad forces at all samples of the presses, (n, pads)."""
-    data = presses.data
-    gain = (
-        None
-        if model.field is None or presses.places is None
-        else by_rows(log_gain, presses.places, before=(model.field,))
-    )
-    rows = data.sample_pressure.T, None if gain is None else LogGain(*(part[data.sample_press] for part in gain))
-    return _valid_forces(model, by_rows(_with_gains, *rows, before=(model,)))
-
-
-@je.verb
-def _with_gains(model: PadModel, own: Float[Array, "n pads"], gain: LogGain | None) -> PadPrediction:
-    """`PadModel.predict` with known gains (None: the curves alone)."""
-    found = _curve_predictions(model.curves, own)
-    return (
-        independent(found) if model.field is None or gain is None else with_gain(found, gain, model.field.field.shared)
-    )
-
-
-def _valid_forces(model: PadModel, found: PadPrediction) -> PadForces:
-    good = np.asarray(model.curves.result) == FitResult.SUCCESS
-    return PadForces(np.where(good, found.force, np.nan), np.asarray(found.total_variance))
 
 
 @je.verb
@@ -363,7 +337,7 @@ def _curve_forces(curves: FittedCurve, pressure: Float[Array, "n pads"]) -> Floa
     return (found * _load_factor(curves, pressure.T)).T
 
 
-def _curve_predictions(curves: FittedCurve, own: Float[Array, "n pads"]) -> Prediction:
+def curve_predictions(curves: FittedCurve, own: Float[Array, "n pads"]) -> Prediction:
     """Forces of the curves of all pads, (n, pads); a pad at rest bears none, whatever the offset of its curve."""
     found, load = predict_pads(curves, own.T), _load_factor(curves, own.T)
     return Prediction((found.force * load).T, (found.standard_error * load).T, found.valid.T)

@@ -18,6 +18,8 @@ from .table import PressMeasurements, Processing, measure
 
 # Least share of a press that a pad must carry for the press to determine the pad's curve and field.
 MIN_SHARE = 1 / 3
+# Fraction of the largest fitted pressure below which the force of a curve that is not zero at rest falls to zero.
+REST_FRACTION = 0.05
 MEANS_PER_PRESS = 24  # that replace the samples of a press, because neighbouring samples are nearly equal
 
 
@@ -34,6 +36,21 @@ class PressSeries(NamedTuple):
     press: np.ndarray
     pressure: np.ndarray
     force: np.ndarray
+
+
+class HoldSeries(NamedTuple):
+    """Samples along all presses and the means over their holds as one series, for curves with memory.
+
+    | field    | meaning                              | shape               | unit |
+    |----------|--------------------------------------|---------------------|------|
+    | pressure | change of the pads' pressures        | (n + presses, pads) | Pa   |
+    | press    | row of the press                     | (n + presses,)      |      |
+    | hold     | row in this series of each hold      | (presses,)          |      |
+    """
+
+    pressure: np.ndarray
+    press: np.ndarray
+    hold: np.ndarray
 
 
 class PadSamples(NamedTuple):
@@ -91,6 +108,17 @@ class PressData:
     def sample_place(self) -> np.ndarray:
         """Number of the place of each sample, (n,)."""
         return np.asarray(self.place[self.sample_press])
+
+    @property
+    def loaded(self) -> np.ndarray:
+        """Flags (pads, n) of samples above rest: `REST_FRACTION` of the largest pressure to which a curve is fitted."""
+        top = np.where(self.mask, self.sample_pressure, 0).max(1, initial=0)
+        return np.asarray(self.sample_pressure >= REST_FRACTION * top[:, None])
+
+    @cached_property
+    def with_holds(self) -> HoldSeries:
+        """The samples, and the means over the holds where they follow the samples before them."""
+        return with_holds(PressSeries(self.sample_press, self.sample_pressure.T, self.sample_force), self.pressure)
 
     def pad_samples(self, *, with_history: bool) -> PadSamples:
         """Samples of each pad; all samples ``with_history``, for a curve that depends on earlier pressures."""
@@ -172,11 +200,8 @@ def pool_presses(sessions: Sequence[Session], skin: je.Skin, processing: Process
     crosstalk = fit_crosstalk(pressure, position, skin.pads)
     pressure = crosstalk.own(pressure)
     owner = dominant_pad(pressure)
-    series = PressSeries(
-        _sample_presses(recordings),
-        crosstalk.own(np.concatenate([m.samples.pressure for m in recordings])),
-        np.concatenate([m.samples.force for m in recordings]),
-    )
+    readings = press_series(recordings)
+    series = readings._replace(pressure=crosstalk.own(readings.pressure))
     tip = np.concatenate([m.presses.tip_diameter[m.presses.accepted] for m in recordings])
     return PooledPresses(
         recordings=recordings,
@@ -216,6 +241,15 @@ def _press_data(
     return replace(data, mask=data.mask & (data.share[means.press] >= MIN_SHARE).T)
 
 
+def press_series(recordings: Sequence[PressMeasurements]) -> PressSeries:
+    """Readings of the pads and forces along all accepted presses; pressures with crosstalk."""
+    return PressSeries(
+        _sample_presses(recordings),
+        np.concatenate([m.samples.pressure for m in recordings]),
+        np.concatenate([m.samples.force for m in recordings]),
+    )
+
+
 def _sample_presses(recordings: Sequence[PressMeasurements]) -> np.ndarray:
     """Row (n,) of the press of each sample, among all accepted presses."""
     rows, first = [], 0
@@ -224,6 +258,20 @@ def _sample_presses(recordings: Sequence[PressMeasurements]) -> np.ndarray:
         rows.append(first + number[m.samples.press])
         first += len(m.force)
     return np.concatenate(rows)
+
+
+def with_holds(series: PressSeries, pressure: np.ndarray) -> HoldSeries:
+    """The samples along presses, with the mean over each hold (presses, pads) Pa after the largest pressure before it.
+
+    A curve with memory depends on the pressures before a hold: all presses before it, and the way up to it.
+    """
+    number = np.arange(len(pressure))
+    first, last = (np.searchsorted(series.press, number, side) for side in ("left", "right"))
+    total = np.nan_to_num(series.pressure).sum(1)
+    rows = np.array([a + 1 + np.argmax(total[a:b]) if b > a else a for a, b in zip(first, last, strict=True)], int)
+    return HoldSeries(
+        np.insert(series.pressure, rows, pressure, axis=0), np.insert(series.press, rows, number), rows + number
+    )
 
 
 def block_means(series: PressSeries, most: int) -> PressSeries:

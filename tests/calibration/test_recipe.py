@@ -78,7 +78,11 @@ def test_a_file_gives_some_choices_and_the_rest_stays(tmp_path):
         '[processing]\ncorrections = ["low-pass:cutoff=20"]\n[processing.windows]\nhold = 0.8\n'
     )
     recipe = calib.Recipe.load(path)
-    assert [CURVES.name_of(c) for c in recipe.curves] == ["linear", "power", "polynomial", "spline"]
+    without_memory = ["linear", "power", "polynomial", "spline"]
+    with_memory = ["play", "hysteresis", "hysteresis-spline"]
+    assert [CURVES.name_of(c) for c in recipe.curves] == without_memory + with_memory
+    memoryless = calib.Recipe.from_toml('curve = "memoryless"')
+    assert [CURVES.name_of(c) for c in memoryless.curves] == without_memory
     assert recipe.locations[0] is None
     assert recipe.locations[1].width == 0.01
     assert (recipe.fidelity.edge_length, recipe.fidelity.order) == (0.06, 2)

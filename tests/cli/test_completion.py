@@ -35,7 +35,7 @@ def script(tmp_path_factory):
         (["re"], {"recalibrate", "record", "recover"}),
         ([""], {*COMMANDS}),
         (["calibrate", "--cur"], {"--curve"}),
-        (["calibrate", "--curve", ""], {*CURVES.shipped, "auto"}),
+        (["calibrate", "--curve", ""], {*CURVES.shipped, "auto", "memoryless"}),
         (["calibrate", "--hyperparameter", "l"], {"l-curve"}),
         (["import", "par"], {"parquet"}),
         (["export", "m"], {"mcap"}),

@@ -1,6 +1,6 @@
 """Recipes as TOML: every choice by its name in a registry, alone or with settings.
 
-curve = ["linear", "power"]                       # several: one is chosen by cross-validation; "auto": the usual ones
+curve = ["linear", "power"]                       # several: one is chosen by cross-validation; or "auto", "memoryless"
 location = {type = "edge", width = 0.008}         # or "edge:width=0.008", as on the command line
 fidelity = "standard"
 even_sheet = false
@@ -40,8 +40,11 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 AUTO = "auto"
-AUTO_CURVES = ("linear", "power", "polynomial", "spline")
-"""Curves that ``auto`` stands for: zero at zero pressure, so that idle pads add nothing, and without memory."""
+MEMORYLESS = "memoryless"
+MEMORYLESS_CURVES = ("linear", "power", "polynomial", "spline")
+"""Curves that ``memoryless`` stands for: zero at zero pressure, so that idle pads add nothing."""
+AUTO_CURVES = (*MEMORYLESS_CURVES, "play", "hysteresis", "hysteresis-spline")
+"""Curves that ``auto`` stands for: also those with memory, whose force depends on the pressures before."""
 NONE = "none"
 DEFAULT = "default"  # corrections: a low-pass where a stream holds something to remove
 FIDELITY_LEVELS: Mapping[str, Callable[..., je.Fidelity]] = {
@@ -56,9 +59,9 @@ SWITCHES = ("even_sheet", "fit_electrodes", "learn_layer")
 
 
 def curve_choice(text: str, allow_import: bool = False) -> AbstractCurve | tuple[AbstractCurve, ...]:
-    """The curve of a word such as ``power:reference=900``; of ``auto`` all of `AUTO_CURVES`."""
-    if text == AUTO:
-        return tuple(CURVES.make(name) for name in AUTO_CURVES)
+    """The curve of a word such as ``power:reference=900``; of ``auto`` and ``memoryless`` the curves they stand for."""
+    if text in (AUTO, MEMORYLESS):
+        return tuple(CURVES.make(name) for name in (AUTO_CURVES if text == AUTO else MEMORYLESS_CURVES))
     return CURVES.make(text, allow_import)
 
 

@@ -22,7 +22,8 @@ from ..fields.base import AbstractField
 from ..fields.fitted import FittedField
 from ..intervals import COVERAGE, NoiseLaw, fit_noise
 from ..losses import AbstractLoss
-from ..pads import LocatedPresses, PadForces, PadModel, fit_pads, predict_holds, predict_samples
+from ..pads import LocatedPresses, PadModel, fit_pads
+from ..press_forces import PadForces, predict_holds, predict_samples
 from ..results import FitResult
 from .scores import assign_folds
 
@@ -170,13 +171,14 @@ class Folds:
         """Mean square error of the total force at each place, (places,) N^2, by fits without the fold of the place.
 
         Places in the folds `without` are left out. NaN at all places if a fit fails: its errors must not be compared
-        with those of others.
+        with those of others. Pads at rest count for no candidate: some curves are zero there, and would be chosen
+        because they leave out the noise of pads that nobody presses.
         """
         data, held = self.presses.data, self.hold_out(curve, field, without)
         kept = ~self._in_folds(without)
         if not np.isfinite(held.hold.force[kept]).all():
             return np.full(len(np.unique(data.place[kept])), np.nan)
-        square = (held.along.force.sum(1) - data.sample_force) ** 2
+        square = (np.where(data.loaded.T, held.along.force, 0).sum(1) - data.sample_force) ** 2
         square = np.where(np.isfinite(data.sample_force) & np.isfinite(data.sample_pressure).all(0), square, 0)
         rows = kept[data.sample_press]
         _, place, count = np.unique(data.sample_place[rows], return_inverse=True, return_counts=True)

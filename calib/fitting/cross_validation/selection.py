@@ -77,17 +77,20 @@ def simplest(
         Candidate(part, option.name, round(option.size, 1), *_root_mean_squares(mean, error), chosen=k == chosen)
         for k, (option, mean, error) in enumerate(zip(options, means, spread, strict=True))
     )
-    listed = ", ".join(f"{c.name} {'not determined' if c.rmse is None else f'{c.rmse:.2f}'}" for c in _listed(table))
-    listed += f" and {len(table) - MAX_LISTED} more" if len(table) > MAX_LISTED else ""
     why = f"{options[chosen].name}, the simplest within one standard error of the paired difference from the best"
-    return options[chosen].choice, f"{why} ({options[least].name}); held-out RMSE over {over} in N: {listed}", table
+    return (
+        options[chosen].choice,
+        f"{why} ({options[least].name}); held-out RMSE over {over} in N: {_listed(table)}",
+        table,
+    )
 
 
-def _listed(table: Sequence[Candidate]) -> list[Candidate]:
-    """All candidates, or the best few of many."""
-    if len(table) <= MAX_LISTED:
-        return list(table)
-    return sorted(table, key=lambda c: np.inf if c.rmse is None else c.rmse)[:MAX_LISTED]
+def _listed(table: Sequence[Candidate]) -> str:
+    """All candidates with their errors; of many the best few, and all that were refused because a fit failed."""
+    limit = sorted(np.inf if c.rmse is None else c.rmse for c in table)[min(MAX_LISTED, len(table)) - 1]
+    listed = [c for c in table if c.rmse is None or c.rmse <= limit]
+    words = ", ".join(f"{c.name} {'not determined' if c.rmse is None else f'{c.rmse:.2f}'}" for c in listed)
+    return words + (f" and {len(table) - len(listed)} more" if len(listed) < len(table) else "")
 
 
 def _standard_error(difference: np.ndarray) -> float:
