@@ -109,11 +109,18 @@ class PressData:
         """Number of the place of each sample, (n,)."""
         return np.asarray(self.place[self.sample_press])
 
-    @property
-    def loaded(self) -> np.ndarray:
-        """Flags (pads, n) of samples above rest: `REST_FRACTION` of the largest pressure to which a curve is fitted."""
-        top = np.where(self.mask, self.sample_pressure, 0).max(1, initial=0)
-        return np.asarray(self.sample_pressure >= REST_FRACTION * top[:, None])
+    @cached_property
+    def rest_forces(self) -> np.ndarray:
+        """Force (pads, n) N on pads at rest, a straight line; NaN above `REST_FRACTION` of the largest fitted pressure.
+
+        The line goes through the mean of the fitted samples.
+        """
+        fitted = np.where(self.mask, self.sample_pressure, 0)
+        force = np.where(self.mask, self.sample_force * self.share[self.sample_press].T, 0).sum(1)
+        total = fitted.sum(1)
+        slope = np.where(total > 0, force / np.where(total > 0, total, 1), 0)
+        at_rest = self.sample_pressure < REST_FRACTION * fitted.max(1, initial=0)[:, None]
+        return np.asarray(np.where(at_rest, slope[:, None] * self.sample_pressure, np.nan))
 
     @cached_property
     def with_holds(self) -> HoldSeries:

@@ -4,21 +4,24 @@ The pads are those of the second simulator (`tests.oracles.bench`): their loops 
 play operators that are fitted.
 """
 
-from itertools import pairwise
-
+import jax
 import numpy as np
 import pytest
 
 import calib
-from calib.calibration.recipes.text import curve_choice
+import jaxeit as je
+from calib.calibration.localisation.press_images import Imager
 from calib.fitting.cross_validation.held_out import Folds, folds_by_place
+from calib.fitting.cross_validation.scores import rmse
 from calib.fitting.cross_validation.selection import Candidate, _listed, choose, nested_selection
 from calib.fitting.curves import CURVES, AffinePlay, Linear, PowerLaw
+from calib.fitting.curves.samples import by_rows
 from calib.fitting.fields import PadEdge, geometry_of, single_places
 from calib.fitting.losses import SoftL1
-from calib.fitting.pads import LocatedPresses, fit_pads
+from calib.fitting.pads import LocatedPresses, fit_pads, forces
 from calib.fitting.press_forces import predict_holds
-from calib.presses.pooled import PressData, PressSeries, with_holds
+from calib.presses.pooled import MEANS_PER_PRESS, PressData, PressSeries, block_means, press_series, with_holds
+from calib.presses.table import measure
 
 from ..oracles.bench import Bench, Faults, simulate, write
 from ..oracles.bench.pads import AREA, yielding
@@ -118,18 +121,56 @@ def simulated(tmp_path_factory):
     return made
 
 
-def calibrated(path, words):
-    recipe = calib.Recipe(curve=curve_choice(words), location=calib.PadEdgeSpline())
+SOME = ("linear", "power", "polynomial", "hysteresis")  # of those that auto stands for: quicker to compile
+
+
+def calibrated(path, names):
+    recipe = calib.Recipe(
+        curve=[CURVES.make(name) for name in names],
+        location=calib.PadEdgeSpline(),
+        imaging=je.Imaging(je.Pixels(24)),
+        fidelity=je.Fidelity.draft(),
+    )
     with calib.open_session(path) as session:
         return calib.calibrate([session], recipe=recipe, ignore_errors=True)
 
 
+@pytest.fixture(scope="module")
+def calibrations(simulated):
+    """Of the skin with hysteresis: with memory among the candidates, and without."""
+    return calibrated(simulated["first"], SOME), calibrated(simulated["first"], SOME[:-1])
+
+
+def errors_along(calibration, found, places):
+    """RMSE (N) of the total force at all samples of measured presses, loading and unloading."""
+    along = block_means(press_series([found]), MEANS_PER_PRESS)
+    rows = along.pressure, jax.tree.map(lambda part: part[along.press], places)
+    return rmse(by_rows(forces, *rows, before=(calibration.pads,)).force.sum(1), along.force)
+
+
 @pytest.mark.slow
-def test_sessions_with_eit_choose_memory_where_it_is(simulated):
-    """On a later session of the skin, forces are better than by the best curve without memory."""
-    found = {words: calibrated(simulated["first"], words) for words in ("auto", "memoryless")}
-    assert [c.curves.curve.path for c in found.values()] == [True, False]
+def test_a_session_with_eit_chooses_memory_where_it_is(simulated, calibrations):
+    """On a later session of the skin, forces along presses are better than by the best curve without memory."""
+    assert [one.curves.curve.path for one in calibrations] == [True, False]
+    along = []
+    for one in calibrations:
+        with calib.open_session(simulated["later"]) as later:
+            found = measure(later, one.skin, one.processing)
+        along.append(errors_along(one, found, Imager(one.recon, one.masks, one.locator).presses(found.dv).places))
+    assert along[0] < 0.85 * along[1]
+
+
+@pytest.mark.slow
+def test_holds_of_a_later_session_follow_their_presses(simulated, calibrations):
+    """They follow a rise of the load, which a curve without memory follows as well. Taken one for the successor of the
+    other, they were off by 1.6 N, and the pads seemed to have moved by 14 %."""
     with calib.open_session(simulated["later"]) as later:
-        errors = [calib.evaluate(c, later, ignore_errors=True).summary()["force_rmse"] for c in found.values()]
-    assert all(small < 0.95 * large for small, large in pairwise(errors))
-    assert not calibrated(simulated["elastic"], "auto").curves.curve.path
+        found = [calib.evaluate(one, later, ignore_errors=True) for one in calibrations]
+    with_memory, without = (one.summary()["force_rmse"] for one in found)
+    assert with_memory < 1.1 * without
+    assert not [note for note in found[0].notes if "calibration health" in note]
+
+
+@pytest.mark.slow
+def test_a_session_with_eit_chooses_no_memory_where_there_is_none(simulated):
+    assert not calibrated(simulated["elastic"], SOME).curves.curve.path

@@ -231,8 +231,17 @@ def _of_contacts(
 def unmoved_forces(
     model: ForceModel, pressures: Float[Array, "n pads"], places: Places | None
 ) -> Float[Array, "n pads"]:
-    """Force on each pad from the pressures that it would have read at the calibration; pure."""
-    return replace(model.pads, gains=None).forces(pressures, places).force
+    """Force on each pad from the pressures that it would have read at the calibration, one row for a contact; pure.
+
+    For a curve with memory, each contact follows a full press and its release, as most presses of a used pad do.
+    """
+    pads = replace(model.pads, gains=None)
+    if not model.remembers:
+        return pads.forces(pressures, places).force
+    full = jnp.broadcast_to(pads.curves.pressure_range[:, 1], pressures.shape)
+    series = jnp.stack([full, jnp.zeros_like(full), pressures], 1).reshape(-1, pressures.shape[1])
+    at = None if places is None else places[jnp.repeat(jnp.arange(len(pressures)), 3)]
+    return pads.forces(series, at).force[2::3]
 
 
 _LOADED_MULTIPLE = 3.0  # of the noise without force: noise rarely exceeds it, so that idle pads stay idle

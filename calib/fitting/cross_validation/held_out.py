@@ -171,14 +171,15 @@ class Folds:
         """Mean square error of the total force at each place, (places,) N^2, by fits without the fold of the place.
 
         Places in the folds `without` are left out. NaN at all places if a fit fails: its errors must not be compared
-        with those of others. Pads at rest count for no candidate: some curves are zero there, and would be chosen
-        because they leave out the noise of pads that nobody presses.
+        with those of others. Pads at rest bear the same force for every candidate: some curves vanish there, and would
+        be chosen because they leave out the noise of pads that nobody presses.
         """
         data, held = self.presses.data, self.hold_out(curve, field, without)
         kept = ~self._in_folds(without)
         if not np.isfinite(held.hold.force[kept]).all():
             return np.full(len(np.unique(data.place[kept])), np.nan)
-        square = (np.where(data.loaded.T, held.along.force, 0).sum(1) - data.sample_force) ** 2
+        at_rest = data.rest_forces.T
+        square = (np.where(np.isfinite(at_rest), at_rest, held.along.force).sum(1) - data.sample_force) ** 2
         square = np.where(np.isfinite(data.sample_force) & np.isfinite(data.sample_pressure).all(0), square, 0)
         rows = kept[data.sample_press]
         _, place, count = np.unique(data.sample_place[rows], return_inverse=True, return_counts=True)
