@@ -1,6 +1,7 @@
 """The `jaxeit` command. Each subcommand is a separate module, imported when it is called, so that --help is quick."""
 
 import argparse
+import gc
 import os
 import select
 import signal
@@ -120,6 +121,18 @@ def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     return parser_with([word for word in argv if not word.startswith("-")][:1], argv)
 
 
+def _imported(name: str) -> Any:
+    """The module of a command. What is imported stays: the garbage collector would look through it again and again."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        return import_module(name, __name__)
+    finally:
+        gc.freeze()
+        if collects:
+            gc.enable()
+
+
 def parser_with(loaded: Collection[str], argv: Sequence[str] = ()) -> argparse.ArgumentParser:
     """The parser of all commands, with the arguments of those that are ``loaded``, for a command line ``argv``."""
     parser = CommandParser(prog="jaxeit", description="Force maps in newtons from EIT-pneumatic robot skins.")
@@ -129,7 +142,7 @@ def parser_with(loaded: Collection[str], argv: Sequence[str] = ()) -> argparse.A
         command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         if name in loaded:
             room = next(room for room, names in ROOMS.items() if name in names)
-            module = import_module(f".commands.{room}.{name}_command", __name__)
+            module = _imported(f".commands.{room}.{name}_command")
             command.set_defaults(command=module.run, parser=command)
             command.words = argv
             module.add_arguments(command)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.optimize import nnls
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 
 import jaxeit as je
 
@@ -162,7 +162,7 @@ def _fisher_scoring(
 def student_factor(freedom: int) -> float:
     """Width of the 90 % interval of Student's distribution of so many degrees of freedom, over that of a known
     deviation."""
-    return float(student_t.ppf(0.5 + COVERAGE / 2, freedom)) / NORMAL_MULTIPLE
+    return float(stdtrit(freedom, 0.5 + COVERAGE / 2)) / NORMAL_MULTIPLE
 
 
 def _pad_scales(residual: np.ndarray, force: np.ndarray, total: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
-from scipy import ndimage, stats
 
 from .corrections import interpolate_missing
 
@@ -85,7 +85,7 @@ def _spiking(values: np.ndarray, idle: np.ndarray) -> np.ndarray:
     if idle.all():
         return np.zeros(len(idle), bool)
     filled = np.apply_along_axis(interpolate_missing, 0, values[:, ~idle])
-    jump = np.abs(filled - ndimage.median_filter(filled, (SPIKE_WINDOW, 1), mode="nearest"))
+    jump = np.abs(filled - scipy.ndimage.median_filter(filled, (SPIKE_WINDOW, 1), mode="nearest"))
     typical = np.median(np.ptp(filled, 0))
     out = np.zeros(len(idle), bool)
     out[~idle] = np.mean(jump > SPIKE_HEIGHT * typical, 0) > SPIKE_FRACTION
@@ -106,4 +106,4 @@ def rank_correlation(column: np.ndarray, reference: np.ndarray) -> float:
     a, b = column[good], reference[good]
     if len(a) < 2 or np.ptp(a) == 0 or np.ptp(b) == 0:
         return 0.0
-    return float(np.corrcoef(stats.rankdata(a), stats.rankdata(b))[0, 1])
+    return float(np.corrcoef(scipy.stats.rankdata(a), scipy.stats.rankdata(b))[0, 1])

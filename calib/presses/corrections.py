@@ -13,7 +13,7 @@ from functools import reduce
 from itertools import pairwise
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from jaxeit.registry import Registry, limited, require_limits
 
@@ -110,7 +110,7 @@ class LowPass(AbstractCorrection):
                 f"{name}: a low-pass of {self.cutoff:g} Hz needs samples faster than {2 * self.cutoff:g} Hz, "
                 f"and these come at {rate:.4g} Hz; choose a cutoff below {rate / 2:.4g} Hz, or leave the low-pass out."
             )
-        return np.asarray(signal.butter(self.order, self.cutoff, fs=rate, output="sos"))
+        return np.asarray(scipy.signal.butter(self.order, self.cutoff, fs=rate, output="sos"))
 
     def apply(self, time: np.ndarray, values: np.ndarray, name: str = "stream") -> np.ndarray:
         if len(time) < 2:
@@ -123,10 +123,10 @@ class LowPass(AbstractCorrection):
 
     def _filter(self, sections: np.ndarray, values: np.ndarray) -> np.ndarray:
         if self.causal:
-            start = signal.sosfilt_zi(sections)[:, :, None] * values[0]
-            return np.asarray(signal.sosfilt(sections, values, axis=0, zi=start)[0])
+            start = scipy.signal.sosfilt_zi(sections)[:, :, None] * values[0]
+            return np.asarray(scipy.signal.sosfilt(sections, values, axis=0, zi=start)[0])
         pad = min(3 * (2 * len(sections) + 1), len(values) - 1)
-        return np.asarray(signal.sosfiltfilt(sections, values, axis=0, padlen=pad))
+        return np.asarray(scipy.signal.sosfiltfilt(sections, values, axis=0, padlen=pad))
 
 
 @dataclass(frozen=True)

@@ -226,7 +226,7 @@ def spline_responses(values: np.ndarray, nodes: Nodes, background: float, dtype:
     """Responses by the splines through a table of `tabulate`."""
     coefficients = jnp.asarray(spline_coefficients(values), dtype)
     numbers = ([axis[0] for axis in nodes.axes], [axis[1] - axis[0] for axis in nodes.axes], nodes.scale, background)
-    return Responses(coefficients, *(jnp.asarray(number, dtype) for number in numbers))
+    return Responses(coefficients, *(jnp.asarray(np.asarray(number, dtype)) for number in numbers))
 
 
 def spline_coefficients(values: np.ndarray) -> np.ndarray:

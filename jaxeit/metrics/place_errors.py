@@ -28,6 +28,11 @@ def localisation_error(estimated: Places, true: Places) -> Float[Array, "..."]:
         raise MetricError(
             f"positions of shapes {found.shape} and {wanted.shape}; give (..., 2) m, as many true as estimated ones"
         )
+    return _distance(found, wanted)
+
+
+@verb
+def _distance(found: Float[Array, "..."], wanted: Float[Array, "..."]) -> Float[Array, "..."]:
     return length(found - wanted)
 
 

@@ -174,7 +174,7 @@ _SINGLE_PRECISION_SIZE = 1 << 18
 def _rounded(leaf: Array) -> Array:
     """Round large tables to single precision, as they are stored, so that a loaded calibration gives equal numbers."""
     single = leaf.ndim > 0 and leaf.size >= _SINGLE_PRECISION_SIZE and jnp.issubdtype(leaf.dtype, jnp.floating)
-    return leaf.astype(jnp.float32).astype(leaf.dtype) if single else leaf
+    return jax.device_put(np.asarray(leaf).astype(np.float32).astype(leaf.dtype)) if single else leaf
 
 
 def locate(

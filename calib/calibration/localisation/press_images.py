@@ -64,7 +64,7 @@ class Imager:
         places = None
         if one is not None:
             places = locate(one, dv, recon, self.masks, image)
-            estimated["fitted"] = np.asarray(places.position[:, 0], float)
+            estimated["fitted"] = np.asarray(places.position, float)[:, 0]
         integral = np.asarray(je.metrics.image_sum(image, self.masks.areas), float)
         return PressImages(np.asarray(image), integral, estimated, places)
 

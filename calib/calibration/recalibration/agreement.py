@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ...fitting.intervals import student_factor
 from ...presses.table import PressMeasurements
@@ -113,7 +113,7 @@ def covariance_of_moves(change: Float[np.ndarray, " n"], error: Float[np.ndarray
     few moves tell their variance roughly: the mean has Student's distribution. Moves that may be errors tell nothing.
     """
     square, count = np.maximum(change**2 - error**2, 0.0), len(change)
-    if count < 2 or np.sum(change**2) <= chi2.ppf(CERTAIN, count - 1) * np.mean(error**2):
+    if count < 2 or np.sum(change**2) <= chdtri(count - 1, 1 - CERTAIN) * np.mean(error**2):
         return np.diag(square)
     common = student_factor(count - 1) ** 2 * square.sum() / (count * (count - 1))
     return np.asarray(np.diag(square) + common)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from ...presses.channel_faults import MIN_ARRAY_CHANNELS, rank_correlation
 from ...presses.streams import true_runs
@@ -43,7 +43,7 @@ def _lagged(a: np.ndarray, b: np.ndarray) -> float:
     """Largest correlation, without sign, at any lag up to a quarter of the length."""
     a, b = ((v - v.mean()) / max(float(v.std()), np.finfo(float).tiny) for v in (a, b))
     middle, most = len(a) - 1, len(a) // 4
-    return float(np.abs(signal.correlate(a, b)[middle - most : middle + most + 1]).max()) / len(a)
+    return float(np.abs(scipy.signal.correlate(a, b)[middle - most : middle + most + 1]).max()) / len(a)
 
 
 def standstill_findings(log: LogBlocks) -> Iterator[Finding]:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage, signal
+from scipy import fft, ndimage
 
 from ...presses.timing.onsets import OnsetDelay, onset_delays
 from ...session.units import SECOND
@@ -144,11 +144,19 @@ def stream_lag(
     size = np.linalg.norm(a) * np.linalg.norm(b)
     if not size > 0:
         return 0.0, 0.0, 0.0
-    correlation = signal.correlate(b, a, method="fft") / size
+    correlation = _correlate(b, a) / size
     lags = np.arange(1 - len(a), len(b)) * step
     within = np.abs(lags) <= MAX_LAG
     best = int(np.argmax(np.where(within, correlation, -np.inf)))
     return float(lags[best]), float(correlation[best]), float(correlation[len(a) - 1])
+
+
+def _correlate(b: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """`scipy.signal.correlate` of all lags by Fourier transforms; to import scipy.signal takes longer than a check."""
+    count = len(a) + len(b) - 1
+    length = fft.next_fast_len(count, real=True)
+    product = fft.rfft(b, length) * fft.rfft(a, length).conj()
+    return np.asarray(np.roll(fft.irfft(product, length), len(a) - 1)[:count])
 
 
 def _without_drift(values: np.ndarray, step: float) -> np.ndarray:

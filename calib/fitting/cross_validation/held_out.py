@@ -286,7 +286,7 @@ def _fit_with_other_pads(
         groups=data.sample_place,
         loss=loss,
     )
-    if not len(empty) or int(pooled.result[0]) != FitResult.SUCCESS:
+    if not len(empty) or np.asarray(pooled.result)[0] != FitResult.SUCCESS:
         return found
 
     def replace_empty(pads: jax.Array, common: jax.Array) -> np.ndarray:

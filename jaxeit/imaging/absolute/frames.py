@@ -65,7 +65,7 @@ def sheet_level(name: str, frame: Float[Array, " readings"], even: Float[Array, 
         InverseError: with the name of the argument, if the frame has the opposite sign.
     """
     level: Float[Array, ""] = _level(frame, even)
-    if not is_traced(level) and not level > 0:
+    if not is_traced(level) and not float(level) > 0:
         raise InverseError(f"{name} has the opposite sign of the model's readings; reverse its polarity")
     return level
 
@@ -124,7 +124,7 @@ def require_explained(
         hint: what ends the message, asked for where there is one.
     """
     left: Array = _relative_misfit(found, known, there)
-    if not is_traced(left) and not left < MAX_UNEXPLAINED:
+    if not is_traced(left) and not float(left) < MAX_UNEXPLAINED:
         raise InverseError(
             f"no {what} explains {name}: {left:.0%} of it is left; give a frame of this skin, readings in the order of "
             f"the skin's protocol{hint()}"

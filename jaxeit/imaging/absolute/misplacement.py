@@ -93,9 +93,9 @@ def find_misplacement(
     """
     require_known("find_misplacement", InverseError, model.nodes, v0, noise)
     frame, physics = even_coat("v0", model, v0, Pixels(COATING_COLUMNS).on(model))
-    penalty = Quadratic(coat_precision(physics.image, COATING_LENGTH), 1 / jnp.asarray(COATING_STD) ** 2)
+    penalty = Quadratic(coat_precision(physics.image, COATING_LENGTH), jnp.asarray(1 / COATING_STD**2))
     coat = gauss_newton(physics, penalty, frame, frame_error(frame, COATING_ERROR))
-    linear = _linear(physics, electrode_motion(model), coat, *solved_fields(model, physics.sigma(coat)))
+    linear = _linear(physics, electrode_motion(model), coat, *solved_fields(model, _conductivity(physics, coat)))
     error = np.asarray(frame_error(frame, MODEL_ERROR), float)
     spread = np.zeros_like(error) if noise is None else real_numbers("noise", noise, "V")
     if spread.shape != error.shape or not (spread >= 0).all():
@@ -151,6 +151,11 @@ def _compared(
         MODEL_ERROR * unshifted.error,
     )
     return Misplacement(*(jnp.asarray(part) for part in parts))
+
+
+@verb
+def _conductivity(physics: LogConductivity, coat: Float[Array, " basis"]) -> Float[Array, " elements"]:
+    return physics.sigma(coat)
 
 
 class _Posterior(NamedTuple):

@@ -1,7 +1,7 @@
 """Fits of kinds of loads to one frame compared by their evidence, and handed out as loads."""
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import log_ndtr
 
 from ..belief import LoadBelief
 from ..pressure import FORCE_INDEX, FORMS, LOAD_PARAMETERS, MAX_LOADS
@@ -31,8 +31,8 @@ def evidences(frame: FrameFits, fits: dict[LoadKind, Fit]) -> dict[LoadKind, flo
         scores = sorted(_separation_score(fits[kind], step, float(threshold)) for step in _separations(fits[kind]))
         fewer = LoadKind.TWO if kind is LoadKind.MORE and scores[1] > 0 else LoadKind.ONE
         if fewer in found:
-            found[fewer] = np.logaddexp(found[fewer], found[kind] + norm.logcdf(-scores[0]))
-            found[kind] += norm.logcdf(scores[0])
+            found[fewer] = np.logaddexp(found[fewer], found[kind] + log_ndtr(-scores[0]))
+            found[kind] += log_ndtr(scores[0])
     return found | {LoadKind.NONE: -0.5 * float(frame.y @ frame.y)}
 
 
