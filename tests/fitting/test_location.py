@@ -180,7 +180,7 @@ def test_the_command_line_knows_every_field_and_curve(capsys):
         cli.main(["calibrate", "--help"])
     said = " ".join(capsys.readouterr().out.split())
     assert "one of none, " + ", ".join(FIELDS) + ", auto --locator" in said
-    assert "one of " + ", ".join(CURVES) + ", auto --location" in said
+    assert "one of " + ", ".join(CURVES) + ", auto, memoryless --location" in said
 
 
 # --- the fit ---------------------------------------------------------------------------------------------------------

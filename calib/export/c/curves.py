@@ -10,7 +10,7 @@ import numpy as np
 
 from ...fitting.curves import CURVES, FittedCurve
 from ...fitting.curves.elementary import ZERO_LOAD
-from ...fitting.pads import REST_FRACTION
+from ...presses.pooled import REST_FRACTION
 from ..errors import ExportError
 
 
