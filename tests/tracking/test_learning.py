@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.bench_learning import GAUSSIAN, Session, Skin
+from benchmarks.bench_learning import GAUSSIAN, HALF_SPACE, Session, Skin
 from benchmarks.problems import fit_model
 
 SEEDS, STAGES, TESTS, PROBES = range(9500, 9506), (0, 10, 30, 120), 20, 12
@@ -17,11 +17,11 @@ def draft():
     return fit_model()
 
 
-def errors_after(model, seed):
+def errors_after(model, seed, shape):
     """Errors (presses,) of the same presses by a layer after each stage: of the place, mm, and of the force by the
     readings alone, relative, by the gain and by the law of contacts as well."""
     skin = Skin(seed)
-    teaching, given = skin.pressed(GAUSSIAN, max(STAGES)), skin.pressed(GAUSSIAN, TESTS)
+    teaching, given = skin.pressed(shape, max(STAGES)), skin.pressed(shape, TESTS)
     session = Session(model, skin, teaching, seed, PROBES)
     shown = [session.shown(given, number) for number in range(TESTS)]
     found = {}
@@ -32,14 +32,14 @@ def errors_after(model, seed):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("shape", [GAUSSIAN, HALF_SPACE])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_learning_makes_contacts_worse_on_no_skin(draft, seed):
+def test_learning_makes_contacts_worse_on_no_skin(draft, seed, shape):
     """Places and forces of 20 presses of tips of 5 to 30 mm, the same ones before and after.
 
-    Loads are Gaussian, as the tracker believes. What presses of other loads teach hardly moves places for better or
-    worse (`docs/contact-layer.md`).
+    On an elastic half-space the first presses tell how loads spread.
     """
-    before, *after = errors_after(draft, seed).values()
+    before, *after = errors_after(draft, seed, shape).values()
     for stage, errors in zip(STAGES[1:], after, strict=True):
         for name, error in errors.items():
             worse = error - before[name]
