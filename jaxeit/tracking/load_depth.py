@@ -24,8 +24,8 @@ DEPTH_LIMITS, PRECISION = (3e-3, 30e-3), 2e-4
 MAX_PRESSES = 12
 # Share of presses that may be misfits where loads are Gaussian.
 MAX_MISFIT_SHARE = 0.1
-# Log of the ratio of probabilities from which a press speaks for a depth, on average. Where loads spread by a depth it is
-# about fifty; less is of a layer of another law, which a depth explains in part, at another place.
+# Log of the ratio of probabilities from which a press speaks for a depth, on average. Where loads spread by a depth it
+# is about fifty; less is of a layer of another law, which a depth explains in part, at another place.
 MIN_LOG_RATIO = 5.0
 
 
