@@ -13,19 +13,17 @@ from scipy.optimize import minimize_scalar
 from .._compile import require_known
 from ..contacts.loads.spreading import Spreading
 from ..imaging.inputs import InverseError
-from .belief.state import Update
+from .belief.state import Pads
 from .model_error import press_observations
 from .tracker import Tracker
 
 # Depths, m, between which the best one is searched: below a third of the usual width loads are as good as Gaussian. The
-# search ends when it is known to this length.
-DEPTH_LIMITS, PRECISION = (3e-3, 30e-3), 2e-4
+# search begins only if presses speak for the trial depth, and ends when the depth is known to this length.
+DEPTH_LIMITS, TRIAL_DEPTH, PRECISION = (3e-3, 30e-3), 8e-3, 2e-4
 # Most presses that tell the depth: a few do, since each is a hundred readings of one number.
 MAX_PRESSES = 12
-# Share of presses that may be misfits where loads are Gaussian.
-MAX_MISFIT_SHARE = 0.1
 # Log of the ratio of probabilities from which a press speaks for a depth, on average. Where loads spread by a depth it
-# is about fifty; less is of a layer of another law, which a depth explains in part, at another place.
+# is fifty and more; less is of a layer of another law, which a depth explains in part, at another place.
 MIN_LOG_RATIO = 5.0
 
 
@@ -39,7 +37,7 @@ def fit_depth(
 
     What covers the sheet spreads loads, and their tails reach farther than those of a Gaussian. A tracker that takes
     loads for Gaussian explains the tails by another place, and by a gain of the contact layer that is none. Loads are
-    Gaussian if nine of ten presses are explained so, or if no depth makes the presses more probable.
+    Gaussian if no depth makes the presses far more probable.
 
     Args:
         tracker: whose loads are Gaussian.
@@ -59,20 +57,18 @@ def fit_depth(
     """
     require_known("fit_depth", InverseError, dv, pad_forces, pad_errors)
     observations = press_observations(tracker, dv, pad_forces, pad_errors)[:MAX_PRESSES]
-    gaussian = [tracker.press_update(tracker.start().belief, *one) for one in observations]
-    if np.mean([tracker.is_misfit(update) for update in gaussian]) <= MAX_MISFIT_SHARE:
-        return 0.0
+    enough = _log_probability(tracker, observations) + MIN_LOG_RATIO * len(observations)
 
     @cache
-    def log_ratio(depth: float) -> float:
-        deeper = _at_depth(tracker, depth)
-        found = [deeper.press_update(deeper.start().belief, *one) for one in observations]
-        return _log_probability(found, tracker.programs.size) - _log_probability(gaussian, tracker.programs.size)
+    def log_probability(depth: float) -> float:
+        return _log_probability(_at_depth(tracker, depth), observations)
 
+    if log_probability(TRIAL_DEPTH) <= enough:
+        return 0.0
     found = minimize_scalar(
-        lambda depth: -log_ratio(float(depth)), bounds=DEPTH_LIMITS, method="bounded", options={"xatol": PRECISION}
+        lambda depth: -log_probability(depth), bounds=DEPTH_LIMITS, method="bounded", options={"xatol": PRECISION}
     )
-    return float(found.x) if log_ratio(float(found.x)) > MIN_LOG_RATIO * len(observations) else 0.0
+    return float(found.x)
 
 
 def _at_depth(tracker: Tracker, depth: float) -> Tracker:
@@ -83,11 +79,13 @@ def _at_depth(tracker: Tracker, depth: float) -> Tracker:
     return Tracker(followed, single, settings, tracker.area, replace(tracker.field, depth=depth))
 
 
-def _log_probability(updates: Sequence[Update], size: int) -> float:
-    """Log of the probability of presses of so many readings, up to a constant.
+def _log_probability(tracker: Tracker, observations: Sequence[tuple[np.ndarray, Pads]]) -> float:
+    """Log of the probability of presses, up to a constant.
 
-    Each press has the error of the model under which it is most probable, and at least that of the settings: a press
-    near a bolt, where any model errs, says no more than others.
+    How far each press errs is not known: a mean over a hold has less noise than a frame, and near a bolt any model
+    errs. With Jeffreys' prior of the scale of its n errors a press of chi-square D has a probability as D^(-n/2).
     """
-    deviances = np.array([-2 * np.nan_to_num(float(one.evidence), nan=-np.inf) for one in updates])
-    return float(-0.5 * size * np.log(np.maximum(deviances / size, 1)).sum())
+    before, size = tracker.start().belief, tracker.programs.size
+    updates = [tracker.press_update(before, *one) for one in observations]
+    deviances = [float(one.misfit) + float(one.correction_square) for one in updates]
+    return float(-0.5 * size * np.log(np.nan_to_num(deviances, nan=np.inf)).sum())
