@@ -197,6 +197,18 @@ def test_no_two_public_things_share_a_name():
     assert {name: things for name, things in _public_names().items() if len(things) > 1} == {}
 
 
+def test_no_two_classes_share_a_name():
+    """Private ones too, except those inside a function or a class, which only their own place names."""
+    found = {}
+    for package in ("jaxeit", "calib"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.parse(path.read_text(encoding="utf-8")).body:
+                if isinstance(node, ast.ClassDef):
+                    found.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
+    assert len(found) > 500
+    assert {name: paths for name, paths in found.items() if len(paths) > 1} == {}
+
+
 def test_bases_that_users_derive_from_are_reachable():
     """Every public class shows its abstract bases in the room that it is in."""
     for name, things in _public_names().items():

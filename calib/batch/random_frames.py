@@ -54,7 +54,7 @@ class WrittenFrames:
 
 
 @dataclass(frozen=True)
-class _Task:
+class _ShardTask:
     """A shard, and all that a worker needs to know; the frame set is pickled, as in `calib.batch.sessions`."""
 
     folder: str
@@ -142,10 +142,10 @@ def _versions(file_format: str) -> dict[str, str]:
     return found | ({"pyarrow": library("pyarrow", TABLES_EXTRA).__version__} if file_format == "parquet" else {})
 
 
-def _tasks(folder: Path, made: FrameSet, mark: str, numbers: Iterable[int]) -> list[_Task]:
+def _tasks(folder: Path, made: FrameSet, mark: str, numbers: Iterable[int]) -> list[_ShardTask]:
     """The tasks that make the shards of these numbers."""
     choices, chosen = pickle.dumps(made), settings()
-    return [_Task(str(folder.absolute()), number, choices, mark, chosen) for number in numbers]
+    return [_ShardTask(str(folder.absolute()), number, choices, mark, chosen) for number in numbers]
 
 
 def _require_space(folder: Path, nbytes: int) -> None:
@@ -168,7 +168,7 @@ def _leave_folder(folder: Path, found: bool) -> None:
 def _run(
     executor: Executor | None,
     jobs: int,
-    tasks: Sequence[_Task],
+    tasks: Sequence[_ShardTask],
     tell: Callable[[int], object],
     finishing: Callable[[int], object],
 ) -> None:
@@ -186,12 +186,12 @@ def _run(
 
 def _run_in(
     executor: Executor,
-    tasks: Sequence[_Task],
+    tasks: Sequence[_ShardTask],
     at_once: int,
     tell: Callable[[int], object],
     finishing: Callable[[int], object],
 ) -> None:
-    def collect(task: _Task, future: Future[None]) -> None:
+    def collect(task: _ShardTask, future: Future[None]) -> None:
         future.result()
         tell(task.number)
 
@@ -217,7 +217,7 @@ def _finish_folder(folder: Path, made: FrameSet) -> int:
 # --- in the worker -------------------------------------------------------------------------------
 
 
-def make_shard(task: _Task) -> None:
+def make_shard(task: _ShardTask) -> None:
     """Simulate and write one shard."""
     with ONE_AT_A_TIME:
         take_over(task.settings)

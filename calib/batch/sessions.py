@@ -63,7 +63,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class _Task:
+class _CalibrationTask:
     """A session, where its results go, and all that a worker needs to know.
 
     The choices (skin, recipe, whether errors are ignored) are pickled, so that a worker takes over the settings of JAX
@@ -150,7 +150,7 @@ def _tasks(
     skin: je.Skin | None,
     recipe: Recipe,
     ignore_errors: bool,
-) -> list[_Task]:
+) -> list[_CalibrationTask]:
     mark = digest(recipe.to_toml(), describe(skin), str(ignore_errors), je.__version__, jax.__version__)
     shared: dict[str, Any] = {
         "report": report,
@@ -170,7 +170,7 @@ def _tasks(
         names[name] = session
         if os.path.abspath(out / name) == session:
             raise SessionError(f"{session}: its result would take its place; choose another folder for the output")
-        tasks.append(_Task(session, os.path.abspath(out / name), **shared))
+        tasks.append(_CalibrationTask(session, os.path.abspath(out / name), **shared))
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -203,7 +203,7 @@ def _line(outcome: Outcome, width: int) -> str:
 
 
 def _run_in_pools(
-    tasks: Sequence[_Task], jobs: int, note: Callable[[Outcome], None], finishing: Callable[[int], object]
+    tasks: Sequence[_CalibrationTask], jobs: int, note: Callable[[Outcome], None], finishing: Callable[[int], object]
 ) -> None:
     """Run the tasks in pools of processes; a session whose worker died is tried once more in a process of its own."""
     left = list(tasks)
@@ -239,15 +239,15 @@ def _pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
 
 def _run(
     executor: Executor,
-    tasks: Sequence[_Task],
+    tasks: Sequence[_CalibrationTask],
     at_once: int,
     note: Callable[[Outcome], None],
     finishing: Callable[[int], object],
-) -> list[_Task]:
+) -> list[_CalibrationTask]:
     """Run all tasks and collect their outcomes; returns the tasks that a broken executor did not do."""
     broken = list(tasks)
 
-    def collect(task: _Task, future: Future[Outcome]) -> None:
+    def collect(task: _CalibrationTask, future: Future[Outcome]) -> None:
         outcome = _outcome_of(future, task)
         if outcome is not None:
             broken.remove(task)
@@ -257,7 +257,7 @@ def _run(
     return broken
 
 
-def _outcome_of(future: Future[Outcome], task: _Task) -> Outcome | None:
+def _outcome_of(future: Future[Outcome], task: _CalibrationTask) -> Outcome | None:
     """The outcome of a task that has ended; None if its executor broke."""
     try:
         return future.result()
@@ -267,7 +267,7 @@ def _outcome_of(future: Future[Outcome], task: _Task) -> Outcome | None:
         return _failed(task, _error_text(error))
 
 
-def _failed(task: _Task, reason: str, seconds: float = 0.0) -> Outcome:
+def _failed(task: _CalibrationTask, reason: str, seconds: float = 0.0) -> Outcome:
     return Outcome(task.session, task.calibration, reason, seconds=seconds)
 
 
@@ -280,7 +280,7 @@ def _error_text(error: Exception) -> str:
 # --- in the worker -------------------------------------------------------------------------------
 
 
-def calibrate_one(task: _Task) -> Outcome:
+def calibrate_one(task: _CalibrationTask) -> Outcome:
     """Do one task, unless it is done already; does not raise for a session that cannot be calibrated."""
     start = time.perf_counter()
     with ONE_AT_A_TIME:
@@ -293,7 +293,7 @@ def calibrate_one(task: _Task) -> Outcome:
             return _failed(task, reason, time.perf_counter() - start)
 
 
-def _do_task(task: _Task) -> Outcome:
+def _do_task(task: _CalibrationTask) -> Outcome:
     """Do a task and return its outcome."""
     with open_session(task.session) as session:
         calibration, skipped = _ensure_calibration(task, session, digest(session.hash, task.mark))
@@ -302,7 +302,9 @@ def _do_task(task: _Task) -> Outcome:
     return Outcome(task.session, task.calibration, "", skipped, calibration.simulated, summary=summary)
 
 
-def _ensure_calibration(task: _Task, session: Session, mark: str) -> tuple[Calibration | LogCalibration, bool]:
+def _ensure_calibration(
+    task: _CalibrationTask, session: Session, mark: str
+) -> tuple[Calibration | LogCalibration, bool]:
     """The calibration of a task, and whether it existed already."""
     with contextlib.suppress(SessionError):
         found = load_calibration(task.calibration)
@@ -317,7 +319,7 @@ def _ensure_calibration(task: _Task, session: Session, mark: str) -> tuple[Calib
     return made, False
 
 
-def _ensure_report(task: _Task, calibration: Calibration | LogCalibration) -> bool:
+def _ensure_report(task: _CalibrationTask, calibration: Calibration | LogCalibration) -> bool:
     """Write the report unless it exists; returns whether it was written. The page is the last of its files."""
     if not task.report or _page_of(task).exists():
         return False
@@ -325,5 +327,5 @@ def _ensure_report(task: _Task, calibration: Calibration | LogCalibration) -> bo
     return True
 
 
-def _page_of(task: _Task) -> Path:
+def _page_of(task: _CalibrationTask) -> Path:
     return Path(task.calibration).with_suffix(".html")

@@ -55,7 +55,7 @@ class _Block:
         return self.voltage / self.frames, self.pressure / self.frames
 
 
-class _Contacts:
+class _NewestBlocks:
     """What an update takes: the newest blocks, of each contact one a place.
 
     Args:
@@ -109,7 +109,7 @@ class LiveRecalibrator:
         self._prior = gain_prior(calibration, drift or GainDrift(), together=True)
         self._reference, self._noise = image_reference(calibration), press_noise(calibration.evaluation)
         self._threshold = loaded_pressures(calibration)
-        self._contacts = _Contacts(self._noise.length)
+        self._contacts = _NewestBlocks(self._noise.length)
         self._block: _Block | None = None
         self._touched: int | None = None  # since when a pad is loaded, ns
         self._blocks, self._last = 0, 0

@@ -73,7 +73,7 @@ def record_rollout(
     with SessionWriter(path, facts) as writer:
         for name, about in _streams(bench.scene.skin, 1 / interval).items():
             writer.add_stream(name, about)
-        touched = _Contacts(robot, bench.scene.skin, reader, rest, frames, steps)
+        touched = _ContactFrames(robot, bench.scene.skin, reader, rest, frames, steps)
         for number, (contacts, missing) in enumerate(progress(touched)):
             state, readings = now(state, contacts)
             time = [round(number * interval * 1e9)]
@@ -84,7 +84,7 @@ def record_rollout(
     return Path(path)
 
 
-class _Contacts:
+class _ContactFrames:
     """Contacts frame by frame, first none; with a length, so that progress can be displayed."""
 
     def __init__(self, robot: mujoco.MjModel, skin: je.Skin, reader: ContactReader, rest: int, frames: int, steps: int):

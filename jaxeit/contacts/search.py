@@ -149,7 +149,7 @@ class ContactFinder(eqx.Module):
         finite = jnp.isfinite(dv) & self.whitening.channels
         frame, whole = self.compressed(dv)
         bumps = self.bumps(frame.root, whole)
-        search = _Search(self, bumps, self.atom_table(frame.root, whole), frame.y)
+        search = _ForwardSelection(self, bumps, self.atom_table(frame.root, whole), frame.y)
         found = jax.lax.stop_gradient(search).select()  # derivatives: see `FrameResponse.linearise`
         return self._contacts(bumps, frame, found, jnp.any(finite))
 
@@ -210,7 +210,7 @@ class ContactFinder(eqx.Module):
         return jnp.where(found.fit.converged, shape, ContactResult.NOT_CONVERGED)
 
 
-class _Search(eqx.Module):
+class _ForwardSelection(eqx.Module):
     """Forward selection of contacts in one frame of whitened readings y; `prepare_contacts` has its stopping rules."""
 
     finder: ContactFinder

@@ -88,7 +88,9 @@ def design_scan(
     given = all_pairs(sensitivity.electrodes) if candidates is None else np.asarray(candidates)
     pattern = Protocol(given, sense_channels=sense_channels).check(sensitivity.electrodes).pattern
     _check_time(readings, switch, len(pattern))
-    search = _Search(criterion or PlaceError(), pattern, _design_cases(sensitivity, pattern, any_dead), progress)
+    search = _DrivenPairSearch(
+        criterion or PlaceError(), pattern, _design_cases(sensitivity, pattern, any_dead), progress
+    )
     if sense_channels == 1:
         found = search.design_readings(readings, switch)
     else:
@@ -120,7 +122,7 @@ def _design_cases(sensitivity: PlaceSensitivity, pattern: np.ndarray, any_dead: 
     return Cases(rows, jnp.asarray(alive, rows.dtype), jnp.diag(sensitivity.prior))
 
 
-class _Design(NamedTuple):
+class _ReadingsDesign(NamedTuple):
     """The mean of h and its bound, indices of the chosen candidates, and the driven pairs where they are prescribed."""
 
     mean: float
@@ -129,7 +131,7 @@ class _Design(NamedTuple):
     drives: tuple[np.ndarray, np.ndarray] | None = None
 
 
-class _Search(NamedTuple):
+class _DrivenPairSearch(NamedTuple):
     """Designs of several numbers of driven pairs; the best one is returned."""
 
     criterion: AbstractCriterion
@@ -137,7 +139,7 @@ class _Search(NamedTuple):
     cases: Cases
     progress: Callable[[Iterable[Any]], Iterable[Any]]
 
-    def design_readings(self, readings: int, switch: float) -> _Design:
+    def design_readings(self, readings: int, switch: float) -> _ReadingsDesign:
         """A design of single readings."""
         weights, bound = _optimal_weights(self.criterion, self.cases, readings, self.progress)
         designs = []
@@ -151,10 +153,10 @@ class _Search(NamedTuple):
                 start, bound = _optimal_weights(self.criterion, part, size, self.progress, start)
             first = np.argsort(-start, kind="stable")[:size]
             chosen, mean = exchange_readings(self.criterion, part, first, self.progress)
-            designs.append(_Design(mean, bound, kept[chosen]))
+            designs.append(_ReadingsDesign(mean, bound, kept[chosen]))
         return min(designs, key=lambda design: design.mean)
 
-    def design_slots(self, frame: FrameBudget) -> _Design:
+    def design_slots(self, frame: FrameBudget) -> _ReadingsDesign:
         """A design of slots; without a cost of switching, any pairs may drive in the end."""
         most = int(frame.time)
         weights, bound = _optimal_weights(
@@ -170,9 +172,9 @@ class _Search(NamedTuple):
         count = -(-np.bincount(drive[found.chosen], minlength=len(drives.pairs)) // frame.channels)
         start = fill_slots(drives, weights, frame, Slots(drive, count))
         slots, mean = exchange_slots(self.criterion, self.cases, drives, frame, start, self.progress)
-        return _Design(mean, bound, slots.chosen, (slots.drive[slots.chosen], drives.pairs))
+        return _ReadingsDesign(mean, bound, slots.chosen, (slots.drive[slots.chosen], drives.pairs))
 
-    def _design_pairs(self, weights: np.ndarray, count: int, frame: FrameBudget) -> _Design:
+    def _design_pairs(self, weights: np.ndarray, count: int, frame: FrameBudget) -> _ReadingsDesign:
         """A design of so many driven pairs at most, those whose readings weigh most."""
         group, pairs = cover_by_pairs(self.pattern, weights, count)
         kept = np.flatnonzero(group >= 0)
@@ -184,7 +186,7 @@ class _Search(NamedTuple):
         best, mean = exchange_slots(self.criterion, part, drives, frame, first, self.progress)
         if len(best.chosen) > readings:  # where fewer pairs drive, there is time for more
             bound = _optimal_weights(self.criterion, part, len(best.chosen), self.progress, start)[1]
-        return _Design(mean, bound, kept[best.chosen], (best.drive[best.chosen], drives.pairs))
+        return _ReadingsDesign(mean, bound, kept[best.chosen], (best.drive[best.chosen], drives.pairs))
 
 
 def _drive_counts(pattern: np.ndarray, weights: np.ndarray, readings: int, switch: float) -> list[int]:

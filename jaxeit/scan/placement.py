@@ -123,7 +123,7 @@ def move_electrodes(
     criterion, limits = criterion or PlaceError(), limits or PlacementLimits()
     settings, fidelity = settings or DesignSettings(), fidelity or Fidelity.draft()
     pattern = np.asarray(skin.protocol.rows("move_electrodes") if pattern is None else pattern)
-    search = _Search.start(skin, criterion, limits, settings, pattern, fidelity)
+    search = _PlacementSearch.start(skin, criterion, limits, settings, pattern, fidelity)
     first, share, made = search.error, MAX_STEP, 1
     for _ in progress(range(meshes - 1)):
         after, made = search.step(share), made + 1
@@ -159,7 +159,7 @@ class _Objective(eqx.Module):
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
+class _PlacementSearch:
     """Electrodes at their present places, on a mesh of their own.
 
     | meaning                                                       | shape                        | unit |
@@ -186,7 +186,7 @@ class _Search:
         settings: DesignSettings,
         pattern: np.ndarray,
         fidelity: Fidelity,
-    ) -> "_Search":
+    ) -> "_PlacementSearch":
         """The search at the present places; raises ProtocolError if they break the limits."""
         initial = np.asarray(skin.electrode_positions, float)
         if limits.margin is None:
@@ -201,14 +201,14 @@ class _Search:
         model = discretise(Scene(skin), fidelity)
         contacts = SiteContacts.of(model, settings, sheet_sites(model, settings.columns))
         objective = _Objective(criterion, model, electrode_motion(model), contacts, jnp.asarray(pattern, jnp.int32))
-        return _Search(skin, limits, fidelity, objective, _value(objective), initial, projection)
+        return _PlacementSearch(skin, limits, fidelity, objective, _value(objective), initial, projection)
 
     @property
     def error(self) -> float:
         """Error of place in the measure of the criterion, m."""
         return float(self.objective.contacts.width) * self.objective.criterion.length(self.value)
 
-    def step(self, share: float) -> "_Search":
+    def step(self, share: float) -> "_PlacementSearch":
         """The electrodes at better places, each at most this share of its reach away in x and y, on a new mesh."""
         positions, objective = np.asarray(self.skin.electrode_positions, float), self.objective
         size, unit = share * float(np.min(np.asarray(objective.motion.reach))), abs(self.value)

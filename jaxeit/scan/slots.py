@@ -130,7 +130,7 @@ def exchange_slots(
     progress: Callable[[Iterable[Any]], Iterable[Any]],
 ) -> tuple[Slots, float]:
     """Improve slots by exchanges; the slots, and the mean of h."""
-    search = _Search(criterion, cases, drives, frame)
+    search = _SlotExchange(criterion, cases, drives, frame)
     for _ in progress(range(2 * len(slots.chosen) + 1)):
         mean, addition, removal = map(np.asarray, _candidate_changes(criterion, cases, _indicator(cases, slots)))
         change = float(mean), addition, removal
@@ -142,7 +142,7 @@ def exchange_slots(
     return slots, float(_candidate_changes(criterion, cases, _indicator(cases, slots))[0])
 
 
-class _Search(NamedTuple):
+class _SlotExchange(NamedTuple):
     """One exchange of a design with slots; each method returns the slots after it, or None if none lowers the mean."""
 
     criterion: AbstractCriterion

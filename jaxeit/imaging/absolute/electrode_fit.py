@@ -153,7 +153,7 @@ def fit_electrodes(
     )
     strength = _first_strengths(model, image, seen, level, settings)
     prior = _prior(image, model.electrodes, len(strength), settings)
-    posterior = _Posterior(model, motion, image, level, settings, known, weight, seen.place, strength, prior)
+    posterior = _ElectrodePosterior(model, motion, image, level, settings, known, weight, seen.place, strength, prior)
     start = jnp.zeros(posterior.size, model.dtype)
     return _described(posterior, *most_probable(posterior, start, IMAGE_STEPS, IMAGE_TOLERANCE))
 
@@ -235,7 +235,7 @@ class _Press(NamedTuple):
     width: Float[Array, ""]
 
 
-class _Posterior(AbstractPosterior):
+class _ElectrodePosterior(AbstractPosterior):
     """Minus the logarithm of the posterior probability of all unknowns, as half a sum of squares.
 
     Frames are the untouched one, and the change by each press.
@@ -339,7 +339,7 @@ class _Posterior(AbstractPosterior):
 
 
 @verb
-def _described(posterior: _Posterior, x: Float[Array, " n"], state: LeastSquaresState) -> ElectrodeFit:
+def _described(posterior: _ElectrodePosterior, x: Float[Array, " n"], state: LeastSquaresState) -> ElectrodeFit:
     parts, shift = posterior.parts(x), posterior.settings.shift
     n, both = posterior.image.size, 2 * posterior.model.electrodes
     solve = normal_inverse(state.quadratic.hessian.matrix, jnp.ones(len(x), bool))

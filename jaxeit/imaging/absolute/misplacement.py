@@ -158,7 +158,7 @@ def _conductivity(physics: LogConductivity, coat: Float[Array, " basis"]) -> Flo
     return physics.sigma(coat)
 
 
-class _Posterior(NamedTuple):
+class _ShiftPosterior(NamedTuple):
     """Minus the log probability of readings, deviations of shifts, m, and errors, and shifts with their variances."""
 
     surprise: float
@@ -182,7 +182,7 @@ def _whitened(
 
 def _beliefs(
     ratio: float, of_coat: Float[np.ndarray, " n"], seen: Float[np.ndarray, "n both_and_2"]
-) -> tuple[_Posterior, _Posterior]:
+) -> tuple[_ShiftPosterior, _ShiftPosterior]:
     """The belief without shifts, and that with the most probable size of shifts, for one ratio of coat to errors.
 
     The principal axes of the whitened slopes serve all sizes; the size of the errors is known in closed form.
@@ -203,9 +203,9 @@ def _beliefs(
     size = SHIFTS * error
     surprise = np.where((ratio * error > MOST_COAT) | (size > MOST_SHIFT), np.inf, surprise)
 
-    def belief(k: int) -> _Posterior:
+    def belief(k: int) -> _ShiftPosterior:
         left = 1 / (1 + told[k])
         shift = axes @ (SHIFTS[k] ** 2 * left * towards)
-        return _Posterior(surprise[k], size[k], error[k], shift, size[k] ** 2 * (axes**2 @ left))
+        return _ShiftPosterior(surprise[k], size[k], error[k], shift, size[k] ** 2 * (axes**2 @ left))
 
     return belief(0), belief(int(np.argmin(surprise)))

@@ -94,7 +94,7 @@ class System(eqx.Module):
         return jnp.einsum("ekr,eka->era", slopes, potential[dofs])
 
 
-class _Contacts(NamedTuple):
+class _ElectrodePieces(NamedTuple):
     """Pieces under complete electrodes: their unknowns (p, k), masses (p, k, k), and electrodes (p,)."""
 
     dofs: np.ndarray
@@ -163,7 +163,7 @@ def stiffness_places(system: System) -> list[np.ndarray]:
     (elements, k, k) as one row; -1 for padding."""
     dofs = np.asarray(system.dofs, int)
     numbers = 1.0 + np.arange(dofs.size * dofs.shape[1]).reshape(*dofs.shape, -1)
-    contacts = _Contacts(np.asarray(system.contact_dofs), np.zeros(0), np.asarray(system.contact_electrode))
+    contacts = _ElectrodePieces(np.asarray(system.contact_dofs), np.zeros(0), np.asarray(system.contact_electrode))
     rims = _Rims(np.asarray(system.rim_element), np.asarray(system.rim_electrode), np.zeros(0), np.zeros(0))
     bridges = _Bridges(np.asarray(system.bridge_element), np.asarray(system.bridge_electrodes), np.zeros(0))
     added = _contact_places(dofs, contacts, rims, bridges, np.asarray(system.electrode_dof))
@@ -182,7 +182,7 @@ def _under_discs(space: Space, touched: Sequence[DiscreteElectrode]) -> dict[str
     }
 
 
-def _contacts(space: Space, unknowns: Unknowns, touched: Sequence[DiscreteElectrode]) -> _Contacts:
+def _contacts(space: Space, unknowns: Unknowns, touched: Sequence[DiscreteElectrode]) -> _ElectrodePieces:
     """All pieces in one array; edges have fewer nodes than triangles and are padded with zeros."""
     width = space.dofs.shape[1]
     dofs, masses, owners = [np.zeros((0, width), int)], [np.zeros((0, width, width))], [np.zeros(0, int)]
@@ -192,10 +192,10 @@ def _contacts(space: Space, unknowns: Unknowns, touched: Sequence[DiscreteElectr
         dofs.append(np.pad(unknowns.index[pieces.dofs], ((0, 0), (0, short)), mode="edge"))
         masses.append(np.pad(pieces.mass, ((0, 0), (0, short), (0, short))))
         owners.append(np.full(len(pieces.dofs), number))
-    return _Contacts(np.concatenate(dofs), np.concatenate(masses), np.concatenate(owners))
+    return _ElectrodePieces(np.concatenate(dofs), np.concatenate(masses), np.concatenate(owners))
 
 
-def _electrode_above(contacts: _Contacts, unknowns: Unknowns) -> np.ndarray:
+def _electrode_above(contacts: _ElectrodePieces, unknowns: Unknowns) -> np.ndarray:
     """The complete electrode over each unknown, or the number of electrodes; (unknowns,)."""
     under = np.full(unknowns.count, len(unknowns.electrode))
     real = contacts.mass.any(2)  # padding has no mass
@@ -227,7 +227,7 @@ def _bridges(rims: _Rims) -> _Bridges:
 
 
 def _contact_places(
-    dofs: np.ndarray, contacts: _Contacts, rims: _Rims, bridges: _Bridges, electrode_dof: np.ndarray
+    dofs: np.ndarray, contacts: _ElectrodePieces, rims: _Rims, bridges: _Bridges, electrode_dof: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Row and column of every contribution of the contacts, in the order of `forward_model.assemble`."""
     rows, cols = _blocks(contacts.dofs)

@@ -115,7 +115,7 @@ def _asked_skin(args: argparse.Namespace) -> "je.Skin":
     return replace(skin, protocol=replace(skin.protocol, sense_channels=args.sense_channels))
 
 
-class _Design(NamedTuple):
+class _DesignedSkin(NamedTuple):
     """The skin and what is expected of it, before and after; and the scan."""
 
     skins: tuple["je.Skin", "je.Skin"]
@@ -129,7 +129,7 @@ def _designed(
     criterion: "AbstractCriterion",
     limits: "PlacementLimits | None",
     readings: int,
-) -> _Design:
+) -> _DesignedSkin:
     """The design of the scan; where electrodes may move, that of the scan after they have."""
     import jaxeit as je
 
@@ -155,7 +155,7 @@ def _designed(
         found = scan(after)
     _require_some_accuracy(after, found.pattern, better)
     better = je.skin.with_rows(better, found.pattern, skin.protocol.sense_channels)
-    return _Design((skin, better), (before, after), found)
+    return _DesignedSkin((skin, better), (before, after), found)
 
 
 def _sensitivity(skin: "je.Skin", settings: "DesignSettings") -> "PlaceSensitivity":
@@ -232,7 +232,7 @@ def _readings(args: argparse.Namespace, skin: "je.Skin") -> int:
     return found
 
 
-def _report(made: _Design, switch: float) -> list[str]:
+def _report(made: _DesignedSkin, switch: float) -> list[str]:
     import numpy as np
 
     (before, after), found = made.skins, made.scan
@@ -278,7 +278,7 @@ def _figures(skin: "je.Skin", sensitivity: "PlaceSensitivity", switch: float) ->
     }
 
 
-def _write_picture(made: _Design, path: Path) -> None:
+def _write_picture(made: _DesignedSkin, path: Path) -> None:
     import numpy as np
 
     from ....report.figures.parts import write_figure
