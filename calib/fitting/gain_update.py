@@ -93,6 +93,8 @@ def update_gains(
     known = solve_triangular(cholesky(prior.covariance, lower=True), np.eye(len(gain)), lower=True)
     sigma, weight, misfit, scatter = np.sqrt(np.diag(covariance)), np.ones(n), 1.0, 0.0
     rows = np.zeros((0, len(gain)))
+    # Not a call of a least-squares solver: the weights follow from medians of the residuals after each step, so that no
+    # sum of squares stays the same over the steps, and a step alone is linear, which one decomposition solves.
     for _ in range(MAX_STEPS if n else 0):
         rows, residual = _whiten(covariance, weight, free, *residuals(gain))
         orthogonal, triangle = np.linalg.qr(np.concatenate([known, rows]))

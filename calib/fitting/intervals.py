@@ -145,6 +145,8 @@ def _fisher_scoring(
         total = known + terms @ parts
         return float(weight @ (np.log(total) + square / total))
 
+    # The deviance is no sum of squares, so that a least-squares solver does not apply. A general minimiser within
+    # bounds, L-BFGS-B, finds the same components and takes longer, since it does not know the expected curvature.
     parts, best = start, deviance(start)
     for _ in range(MAX_STEPS):
         row = np.sqrt(weight) / (known + terms @ parts)

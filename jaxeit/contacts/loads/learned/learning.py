@@ -238,6 +238,8 @@ def _fit_law(presses: _Presses, logs: np.ndarray, starts: list[np.ndarray]) -> t
     def deviance(fits: list[Fit], logs: np.ndarray, inliers: list[int]) -> float:
         return sum(fits[k].deviance for k in inliers) + float(np.sum((logs / LAW_STD) ** 2))
 
+    # Not `LevenbergMarquardt`: a trial fits all presses anew, by programs that the host chooses and no traced solver
+    # can call; the deviance has log det R besides the squares; and outliers, chosen before each step, change it.
     fits = presses.with_law(logs).fits(starts)
     for _ in range(MAX_STEPS):
         squares = np.array([fit.square for fit in fits])
