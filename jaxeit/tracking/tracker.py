@@ -72,13 +72,8 @@ class Tracker:
         self, tracker: ContactFilter, presses: ContactFilter, settings: TrackerSettings, area: float, field: GainField
     ):
         """`presses`: the filter of single presses, which reaches farther; `area`: of the skin, m^2."""
-        self.filter, self.press_filter, self.events, self.field = (
-            tracker,
-            presses,
-            EventHypotheses(settings, area),
-            field,
-        )
-        self.area = area
+        self.filter, self.press_filter, self.events = tracker, presses, EventHypotheses(settings, area)
+        self.area, self.field = area, field
         self._settings, self.programs = settings, Programs(tracker)
 
     @cached_property
