@@ -39,7 +39,7 @@ CURVES = {"linear": calib.Linear(), "affine": calib.Affine(), "power law": calib
 RECIPES = (("linear", "none"), ("linear", "pad edge"), ("power law", "pad edge"))  # curve, and location field
 SMOKE = calib.Recipe(
     location=calib.fitting.Bilinear(nodes=2, shared=True),
-    locator=calib.ImageCentroid(),
+    locator=calib.calibration.ImageCentroid(),
     fidelity=je.Fidelity.draft(),
     folds=2,
 )

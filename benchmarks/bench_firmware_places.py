@@ -27,7 +27,7 @@ def places(run: Run) -> Iterator[Row]:
         plain = calib.calibrate([session], recipe=calib.Recipe())
         yield {"rows": [row("none", "none", plain.evaluation)]}
         for name in run.sizes(ESTIMATORS, ESTIMATORS[:1]):
-            locator = calib.ImageCentroid(je.metrics.ESTIMATORS.make(name))
+            locator = calib.calibration.ImageCentroid(je.metrics.ESTIMATORS.make(name))
             recipe = calib.Recipe(location=calib.PadEdge(), locator=locator)
             found = calib.calibrate([session], recipe=recipe)
             yield {"rows": [row(f"image-centroid, {name}", "the same", found.evaluation)]}
@@ -41,7 +41,7 @@ def places(run: Run) -> Iterator[Row]:
             yield {"rows": [row("fitted-contact", f"--place {name}", moved)]}
 
 
-def row(calibrated: str, header: str, found: calib.Evaluation) -> Row:
+def row(calibrated: str, header: str, found: calib.calibration.Evaluation) -> Row:
     """Sources of the places, and root mean square and largest of the errors of the total force, N."""
     error = found.total_force - found.force
     rmse, worst = float(np.sqrt(np.nanmean(error**2))), float(np.nanmax(np.abs(error)))

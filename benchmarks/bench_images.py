@@ -113,7 +113,7 @@ def by_image(recon: Any, one: Simulated, level: float) -> Seen:
     return Seen(places, sums, in_regions(recon, np.asarray(images), level))
 
 
-def by_fit(finder: je.ContactFinder, one: Simulated) -> Seen:
+def by_fit(finder: je.contacts.ContactFinder, one: Simulated) -> Seen:
     contacts = finder(one.frames)
     singles = slice(len(one.sites))
     places = {"parametric": np.asarray(je.contacts.strongest(contacts))[singles]}

@@ -57,7 +57,7 @@ def layouts(rng: np.random.Generator, grids: Iterable[int], counts: Iterable[int
 def measure(run: Run) -> Iterator[Row]:
     """Rows by layout and correction, over all skins."""
     skins, tests, grids, counts = run.sizes((SKINS, TESTS, GRIDS, SCATTERED), (1, 4, (6,), ()))
-    recipe = calib.Recipe(locator=calib.ImageCentroid(), folds=2) if run.smoke else calib.Recipe()
+    recipe = calib.Recipe(locator=calib.calibration.ImageCentroid(), folds=2) if run.smoke else calib.Recipe()
     bench, found = load_bench(str(SCENE)), []
     for seed in range(FIRST_SEED, FIRST_SEED + skins):
         rng = np.random.default_rng(seed)

@@ -66,8 +66,10 @@ LATER = {
 }
 SKINS = (51, 52, 53, 54)
 FULL, SMOKE = Bench(), Bench(places=16, levels=(10.0, 20.0), spacing=6e-3)
-RECIPE = calib.Recipe(location=calib.PadEdge(), curve=calib.MonotonePolynomial())
-DRAFT = replace(RECIPE, curve=calib.Linear(), fidelity=je.Fidelity.draft(), locator=calib.ImageCentroid(), folds=2)
+RECIPE = calib.Recipe(location=calib.PadEdge(), curve=calib.fitting.MonotonePolynomial())
+DRAFT = replace(
+    RECIPE, curve=calib.Linear(), fidelity=je.Fidelity.draft(), locator=calib.calibration.ImageCentroid(), folds=2
+)
 
 
 def measure(run: Run) -> Iterator[Row]:

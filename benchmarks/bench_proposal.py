@@ -85,7 +85,7 @@ class Ready(NamedTuple):
     proposal: Proposal
     fitter: LoadFitter
     taught: LoadFitter
-    finder: je.ContactFinder
+    finder: je.contacts.ContactFinder
 
     def searched(self, frame: np.ndarray, taught: bool = False) -> Loads:
         """Loads by a search."""

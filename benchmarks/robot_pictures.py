@@ -46,7 +46,7 @@ def main() -> None:
 
 def located() -> calib.Calibration:
     """A calibration with a correction by location at the place of the image, of the bundled session."""
-    recipe = calib.Recipe(location=calib.PadEdge(), locator=calib.ImageCentroid())
+    recipe = calib.Recipe(location=calib.PadEdge(), locator=calib.calibration.ImageCentroid())
     with calib.open_session(ROOT / "data" / "sessions" / "testbed_grid.h5") as session:
         return calib.calibrate([session], recipe=recipe)
 

@@ -27,6 +27,19 @@ Example:
         calib.apply(calibration, other, "forcemap.h5")  # the force map of every frame
 """
 
+from importlib import import_module
+from typing import Any
+
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    try:
+        return _attribute(name)
+    except AttributeError:
+        if name.startswith("_"):
+            raise
+        hints = import_module("jaxeit.messages.missing_names")  # on an error only
+        raise AttributeError(hints.message(__file__, name, __all__), name=name) from None

@@ -20,24 +20,18 @@ from .batch.parquet_frames import export_training_frames as export_training_fram
 from .batch.random_frames import write_training_frames as write_training_frames
 from .batch.sessions import calibrate_many as calibrate_many
 from .bench import (
-    Bench as Bench,
     load_bench as load_bench,
     open_training_frames as open_training_frames,
     simulate as simulate,
 )
 from .calibration import (
     Calibration as Calibration,
-    Evaluation as Evaluation,
-    ForceEstimate as ForceEstimate,
-    ImageCentroid as ImageCentroid,
-    LogCalibration as LogCalibration,
     Recipe as Recipe,
     apply as apply,
     calibrate as calibrate,
     evaluate as evaluate,
     force_map as force_map,
     load_calibration as load_calibration,
-    locate as locate,
     recalibrate as recalibrate,
 )
 from .check import check_session as check_session
@@ -50,8 +44,6 @@ from .export import (
 from .fitting import (
     Affine as Affine,
     Linear as Linear,
-    MonotonePolynomial as MonotonePolynomial,
-    MonotoneSpline as MonotoneSpline,
     PadEdge as PadEdge,
     PadEdgeSpline as PadEdgeSpline,
     PowerLaw as PowerLaw,

@@ -42,7 +42,7 @@ def __getattr__(name: str) -> Any:
         if name.startswith("_"):
             raise
         hints = import_module(".messages.missing_names", __name__)  # on an error only
-        raise AttributeError(hints.message(name, __all__), name=name) from None
+        raise AttributeError(hints.message(__file__, name, __all__), name=name) from None
 
 
 __version__ = metadata.version("jaxeit")

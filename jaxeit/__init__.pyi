@@ -30,11 +30,9 @@ from .accuracy import ladder as ladder
 from .batches import bind_many as bind_many
 from .budget import Budget as Budget, BudgetError as BudgetError
 from .contacts import (
-    ContactFinder as ContactFinder,
-    Contacts as Contacts,
     prepare_contacts as prepare_contacts,
 )
-from .fusion import ForceMap as ForceMap, PadMasks as PadMasks, fuse as fuse, pad_masks as pad_masks
+from .fusion import fuse as fuse, pad_masks as pad_masks
 from .geometry import Cylinder as Cylinder, Disc as Disc, Polygon as Polygon, Rectangle as Rectangle, Sphere as Sphere
 from .imaging import (
     AbstractPrior as AbstractPrior,

@@ -347,7 +347,7 @@ def calibration(folder: Path) -> bytes:
         centre=np.array([0.1, 0.1]),
         held_out_by="location",
     )
-    masks = je.PadMasks(jnp.eye(4), recon.areas)
+    masks = je.fusion.PadMasks(jnp.eye(4), recon.areas)
     about = {"created_utc": "2026-01-01", "curve": "power", "location": "none"}
     Calibration(skin, recon, masks, curves, judged, about, True).save(folder / "good.h5")
     return (folder / "good.h5").read_bytes()

@@ -18,6 +18,7 @@ import pytest
 
 import calib
 import jaxeit as je
+from benchmarks.house import MAX_NAMES
 
 ROOT = Path(__file__).parents[1]
 ORDER = [
@@ -26,7 +27,7 @@ ORDER = [
     "imaging", "metrics", "fusion", "contacts", "tracking", "scan", "accuracy", "plot", "__main__",
 ]  # fmt: skip
 BENCH = [
-    "_lazy", "session", "presses", "fitting", "runtime", "record", "check", "calibration", "export", "bench",
+    "session", "presses", "fitting", "runtime", "record", "check", "calibration", "export", "bench",
     "simulators", "live", "report", "batch", "learning", "tanks", "cli",
 ]  # fmt: skip
 
@@ -236,7 +237,7 @@ def _public_functions():
 
 def test_public_functions_are_annotated():
     functions = _public_functions()
-    assert {unwrap(je.fuse), unwrap(je.ContactFinder.__call__)} <= functions
+    assert {unwrap(je.fuse), unwrap(je.contacts.ContactFinder.__call__)} <= functions
     incomplete = {}
     for function in functions:
         names = {*signature(function).parameters, "return"} - {"self", "cls"}
@@ -244,6 +245,12 @@ def test_public_functions_are_annotated():
             room = ".".join(function.__module__.split(".")[:2])
             incomplete.setdefault(room, []).append(f"{function.__qualname__}: {', '.join(sorted(missing))}")
     assert incomplete == {}
+
+
+@pytest.mark.parametrize(("package", "most"), list(zip((je, calib), MAX_NAMES, strict=True)), ids=["je", "calib"])
+def test_the_names_at_the_top_are_few(package, most):
+    names = [name for name in package.__all__ if not isinstance(getattr(package, name), ModuleType)]
+    assert most / 2 < len(names) <= most
 
 
 def test_names_of_calib_are_there():
@@ -334,14 +341,18 @@ def test_float32_runs_without_x64():
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("package", "name", "said"),
     [
-        ("LCurve", "jaxeit has no LCurve; it is jaxeit.imaging.LCurve"),
-        ("Nosser", "jaxeit has no Nosser; did you mean 'Noser'?"),
-        ("eidors_obj", "jaxeit has no eidors_obj"),
+        (je, "LCurve", "jaxeit has no LCurve; it is jaxeit.imaging.LCurve"),
+        (je, "ForceMap", "jaxeit has no ForceMap; it is jaxeit.fusion.ForceMap"),  # a room that is one module
+        (je, "Nosser", "jaxeit has no Nosser; did you mean 'Noser'?"),
+        (je, "eidors_obj", "jaxeit has no eidors_obj"),
+        (calib, "Evaluation", "calib has no Evaluation; it is calib.calibration.Evaluation"),
+        (calib, "calibrat", "calib has no calibrat; did you mean 'calibrate'?"),
+        (calib, "mk_stim_patterns", "calib has no mk_stim_patterns"),  # a word of what images, which calib does not
     ],
 )
-def test_a_name_of_a_room_is_told_where_it_is_missed(name, said):
+def test_a_name_of_a_room_is_told_where_it_is_missed(package, name, said):
     with pytest.raises(AttributeError) as caught:
-        getattr(je, name)
+        getattr(package, name)
     assert str(caught.value) == said

@@ -114,7 +114,7 @@ def test_a_reconstructor_shows_the_noise_of_its_pixels(recon, small):
 
 def test_a_force_map_shows_the_frame_of_the_largest_force(recon):
     half = jnp.where(recon.centres[:, 0] < 0.1, 1.0, 0.0)
-    masks = je.PadMasks(jnp.stack([half, 1 - half]), recon.areas, recon.shape)
+    masks = je.fusion.PadMasks(jnp.stack([half, 1 - half]), recon.areas, recon.shape)
     images = jnp.zeros((3, 25)).at[:, 7].set(1.0)  # the second row from below, third column: on the right pad
     fused = je.fuse(images, masks, jnp.array([[0.0, 1.0], [0.0, 5.0], [0.0, 2.0]]))
     tree = shown(fused)
@@ -122,7 +122,7 @@ def test_a_force_map_shows_the_frame_of_the_largest_force(recon):
     assert table(tree)["force"] == "5 N"
     assert table(tree)["pads whose image gives the shape"] == "1 of 2"
     np.testing.assert_array_equal(np.argwhere(opacity(tree)), [[1, 2]])
-    alone = je.fuse(images[0], je.PadMasks(masks.weights, masks.areas), jnp.array([0.0, jnp.nan]))
+    alone = je.fuse(images[0], je.fusion.PadMasks(masks.weights, masks.areas), jnp.array([0.0, jnp.nan]))
     assert "svg" not in alone._repr_html_()
     assert table(shown(alone))["force"] == "0 N"
 

@@ -82,7 +82,7 @@ class Calibration:
 
     skin: je.Skin
     recon: je.Reconstructor | je.imaging.IterativeReconstructor
-    masks: je.PadMasks
+    masks: je.fusion.PadMasks
     curves: FittedCurve
     evaluation: Evaluation
     provenance: dict[str, str]

@@ -16,7 +16,7 @@ Example:
     pressures = np.sort(rng.uniform(0, 6000, (2, 300)))  # Pa, of two pads
     forces = np.array([[1.6e-3], [1.2e-3]]) * pressures**1.05 + 0.1 * rng.normal(size=(2, 300))  # N
     forces[:, ::50] += 5.0  # spikes, which a robust loss leaves out
-    for curve in (calib.Linear(), calib.PowerLaw(), calib.MonotoneSpline()):
+    for curve in (calib.Linear(), calib.PowerLaw(), calib.fitting.MonotoneSpline()):
         fitted = calib.fit_curves(curve, pressures, forces, loss=fitting.Huber())
         print(curve.name, fitted.scale, [fitting.FitResult(int(r)).name for r in fitted.result])  # N
     found = fitted.pad(0).predict(np.array([1000.0, 9000.0]))

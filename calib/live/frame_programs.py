@@ -134,7 +134,7 @@ def _unpack_forces(row: np.ndarray, pads: int, image: np.ndarray) -> FrameForces
     return FrameForces(row[: -5 * pads], force, error, valid > 0, loaded > 0, negative > 0, image)
 
 
-def _find_contacts(model: ForceModel, frame: Array) -> tuple[Places, je.Contacts | None]:
+def _find_contacts(model: ForceModel, frame: Array) -> tuple[Places, je.contacts.Contacts | None]:
     """Places, and the contacts from which they come; None for a locator that fits no contacts."""
     if isinstance(model.locator, ContactLocator):
         found = model.locator.finder(frame)
@@ -143,7 +143,7 @@ def _find_contacts(model: ForceModel, frame: Array) -> tuple[Places, je.Contacts
     return model.locator(frame, model.recon(frame), model.recon, model.masks), None
 
 
-def _touch_estimates(found: je.Contacts) -> TouchEstimates:
+def _touch_estimates(found: je.contacts.Contacts) -> TouchEstimates:
     present, position, covariance, result = (
         np.asarray(part[0]) for part in (found.present, found.position, found.covariance, found.result)
     )

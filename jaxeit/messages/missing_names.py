@@ -1,4 +1,4 @@
-"""Names that `jaxeit` does not have: the room that has them, the word of jaxeit for them, or the nearest name.
+"""Names that a package does not have: the room that has them, the word of jaxeit for them, or the nearest name.
 
 The words of other packages are the tables of docs/from-eidors.md and docs/from-pyeit.md.
 """
@@ -51,18 +51,21 @@ WORDS = {
 """Package and page -> word of the package -> what the page says for it."""
 
 
-def message(name: str, known: Sequence[str]) -> str:
-    """The message of the error for a name that `jaxeit` does not have; ``known`` are those that it has."""
-    hint = _room_of(name) or _translation(name) or did_you_mean(name, known)
-    return f"jaxeit has no {name}" + (f"; {hint}" if hint else "")
+def message(file: str, name: str, known: Sequence[str]) -> str:
+    """The message of the error for a name that a package lacks: its ``__init__`` is `file`, and its names `known`."""
+    package = Path(file).parent
+    translation = _translation(name) if package.name == "jaxeit" else ""
+    hint = _room_of(package, name) or translation or did_you_mean(name, known)
+    return f"{package.name} has no {name}" + (f"; {hint}" if hint else "")
 
 
-def _room_of(name: str) -> str:
-    """Where the name is, by the lists of the rooms: none of them is imported."""
-    own = re.escape(name)
-    for room in sorted(Path(__file__).parents[1].glob("*/__init__.py*")):  # of Python, and stubs of names on first use
-        if re.search(rf'^    "{own}",$|\b{own} as {own}\b', room.read_text(encoding="utf-8"), re.MULTILINE):
-            return f"it is jaxeit.{room.parent.name}.{name}"
+def _room_of(package: Path, name: str) -> str:
+    """Where the name is, by the lists of the rooms, which may be single modules: none of them is imported."""
+    own, stub = re.escape(name), (package / "__init__.pyi").read_text(encoding="utf-8")
+    for room in re.findall(r"^    (\w+) as \1,$", stub.partition(")")[0], re.MULTILINE):
+        for listing in [*package.glob(f"{room}/__init__.py*"), *package.glob(f"{room}.py")]:  # .pyi: of a lazy room
+            if re.search(rf'^    "{own}",$|\b{own} as {own}\b', listing.read_text(encoding="utf-8"), re.MULTILINE):
+                return f"it is {package.name}.{room}.{name}"
     return ""
 
 

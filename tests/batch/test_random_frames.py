@@ -382,7 +382,7 @@ def _small_bench(*more, law=None):
     skin = skin_of(je.Rectangle(0.1, 0.1), electrodes, [[0, 1, 2, 3], [1, 2, 3, 0]])
     law = je.effects.ContactPiezoresistance() if law is None else law
     scene = je.Scene(skin, (je.effects.LoadSpreading(), law, *more))
-    return calib.Bench(scene, np.zeros((1, 2)) + 0.05, np.array([5.0]))
+    return calib.bench.Bench(scene, np.zeros((1, 2)) + 0.05, np.array([5.0]))
 
 
 def test_a_skin_without_pads(tmp_path):

@@ -421,7 +421,7 @@ def test_a_grid_of_presses_keeps_what_an_l_shaped_sheet_holds(tmp_path):
 
 def test_a_skin_without_pads_makes_no_session(skin, tmp_path):
     scene = je.Scene(replace(skin, pads=()), effects=())
-    bare = calib.Bench(scene, sites=np.array([[0.1, 0.1]]), forces=np.array([5.0]))
+    bare = calib.bench.Bench(scene, sites=np.array([[0.1, 0.1]]), forces=np.array([5.0]))
     with pytest.raises(calib.bench.BenchError, match=r"the skin 'testbed' has no pads for a session to hold; add"):
         calib.simulate(bare, tmp_path / "s.h5")
 

@@ -209,7 +209,9 @@ def located(grid):
     with calib.open_session(grid) as session:
         return calib.calibrate(
             [session],
-            recipe=replace(QUICK, location=calib.fitting.Bilinear(nodes=2, shared=True), locator=calib.ImageCentroid()),
+            recipe=replace(
+                QUICK, location=calib.fitting.Bilinear(nodes=2, shared=True), locator=calib.calibration.ImageCentroid()
+            ),
         )
 
 
@@ -282,7 +284,7 @@ def test_a_fitted_contact_is_stored_as_numbers_and_finds_the_presses(model, cali
     assert all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (made, again)), strict=True))
     with calib.open_session(grid) as session:
         found = measure(session, calibration.skin)
-    places = calib.locate(again.single(), found.dv, calibration.recon, calibration.masks)
+    places = calib.calibration.locate(again.single(), found.dv, calibration.recon, calibration.masks)
     error = np.linalg.norm(np.asarray(places.position)[:, 0] - found.position, axis=1)
     assert error.mean() < 0.006  # a draft mesh, and a table to match
 

@@ -90,10 +90,10 @@ def test_a_sound_estimator_of_ones_own_gets_a_note_that_its_file_needs_it(calibr
 def test_a_few_presses_off_the_sheet_are_not_refused(skin):
     place = np.full((10, 2), 0.1)
     place[:5] = 5.0
-    require_on_sheet(skin, single_places(jnp.asarray(place), 4), calib.ImageCentroid())
+    require_on_sheet(skin, single_places(jnp.asarray(place), 4), calib.calibration.ImageCentroid())
     place[5] = np.nan
     with pytest.raises(calib.fitting.FitError, match="the places of 5 of 9 presses"):
-        require_on_sheet(skin, single_places(jnp.asarray(place), 4), calib.ImageCentroid())
+        require_on_sheet(skin, single_places(jnp.asarray(place), 4), calib.calibration.ImageCentroid())
 
 
 @pytest.fixture

@@ -34,7 +34,7 @@ RECIPES = {
         ),
     ),
     "presses": calib.Recipe(
-        locator=calib.ImageCentroid(je.LevelCentroid(0.25)),
+        locator=calib.calibration.ImageCentroid(je.LevelCentroid(0.25)),
         loss=calib.fitting.Huber(2.0),
         folds=3,
         processing=calib.presses.Processing(

@@ -98,7 +98,7 @@ def recon(model):
 def calibration(skin, recon):
     curves = fitted(calib.Linear())
     return calib.Calibration(
-        skin, recon, je.pad_masks(skin, recon), curves, stand_in(calib.Evaluation), {}, simulated=True
+        skin, recon, je.pad_masks(skin, recon), curves, stand_in(calib.calibration.Evaluation), {}, simulated=True
     )
 
 
@@ -465,7 +465,7 @@ def test_what_cannot_be_exported_is_refused(calibration, model, tmp_path):
     refused(replace(calibration, recon=iterative), tmp_path, r"solves a problem for each frame.*--method one-step")
     correlated = eqx.tree_at(lambda r: r.whitening.weight, calibration.recon, jnp.eye(550))
     refused(replace(calibration, recon=correlated), tmp_path, r"covariance between readings.*--noise measured")
-    refused(stand_in(calib.LogCalibration), tmp_path, "a log has no EIT")
+    refused(stand_in(calib.calibration.LogCalibration), tmp_path, "a log has no EIT")
     located = replace(calibration, field=stand_in(FittedField))
     own = type("Own", (calib.fitting.PadEdge,), {"name": "own"})()
     refused(

@@ -128,7 +128,7 @@ def test_an_insole_in_a_chamber_is_fitted_but_for_a_taxel_or_two():
         return np.where(failed[:, None], np.nan, np.asarray(predict_pads(found, press).force))
 
     floor = _held_out(cubic, force)
-    for law in (calib.MonotonePolynomial(), calib.MonotoneSpline(), AffinePlay(), PlaySpline()):
+    for law in (calib.fitting.MonotonePolynomial(), calib.fitting.MonotoneSpline(), AffinePlay(), PlaySpline()):
         errors = _held_out(partial(fitted, law), force)
         assert np.nanmedian(errors) < np.median(floor)
     assert np.mean(errors < floor) > 0.7

@@ -163,7 +163,7 @@ def test_a_mask_of_nothing_divides_nothing(pixels, masks):
 def test_a_pixel_that_misses_the_sheet_has_no_pressure_and_no_slope():
     def pressure(force):
         none = jnp.zeros(1)
-        return je.ForceMap(force, none > 0, none, none, areas=jnp.array([2.0, 0.0])).pressure
+        return je.fusion.ForceMap(force, none > 0, none, none, areas=jnp.array([2.0, 0.0])).pressure
 
     np.testing.assert_array_equal(pressure(jnp.array([1.0, 0.0])), [0.5, 0])
     np.testing.assert_array_equal(jax.jacobian(pressure)(jnp.array([1.0, 0.0])), [[0.5, 0], [0, 0]])

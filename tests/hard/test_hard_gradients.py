@@ -227,7 +227,7 @@ def _reference(t):
 
 def _fuse(t):
     half = (jnp.arange(PIXELS) < PIXELS // 2).astype(t.dtype)
-    masks = je.PadMasks(jnp.stack([half, 1 - half]), t.basis.areas)
+    masks = je.fusion.PadMasks(jnp.stack([half, 1 - half]), t.basis.areas)
     image = jnp.abs(t.draw(PIXELS))
 
     def force(x):
@@ -244,7 +244,7 @@ def _fuse(t):
 def _contact_shares(t):
     """Of two contacts on two pads; alike, on a corner of a pixel, absent, of no width."""
     half = (jnp.arange(PIXELS) < PIXELS // 2).astype(t.dtype)
-    masks = je.PadMasks(jnp.stack([half, 1 - half]), t.basis.areas)
+    masks = je.fusion.PadMasks(jnp.stack([half, 1 - half]), t.basis.areas)
 
     def shares(x):
         found = je.fusion.contact_shares(x[:4].reshape(2, 2), x[4:6], x[6:], t.basis.centres, masks)
@@ -394,7 +394,7 @@ def _otsu(t):
 
 def _contacts(t):
     def place(x):
-        fields = je.Contacts(
+        fields = je.contacts.Contacts(
             x[:1] > 0, x[1:3][None], *[jnp.ones(1, t.dtype)] * 2, jnp.ones((1, 4, 4)), x[0], jnp.zeros(1, int)
         )
         return jnp.append(je.contacts.strongest(fields), fields.strength)
@@ -743,7 +743,7 @@ def _everything() -> str:
     basis = je.Pixels(SIDE).on(model)
     dv = je.forward(model, 1.3 * model.background) - je.forward(model)
     recon = je.prepare(model, basis=basis)
-    masks = je.PadMasks(jnp.ones((1, PIXELS)), basis.areas)
+    masks = je.fusion.PadMasks(jnp.ones((1, PIXELS)), basis.areas)
     sparse = je.prepare(model, je.Noser(), je.SparseBayes(), basis)
     found = dv, je.jacobian(model, basis=basis), recon.matrix, sparse(dv), je.fuse(recon(dv), masks, jnp.ones(1)).force
     return hashlib.sha256(b"".join(np.asarray(a).tobytes() for a in found)).hexdigest()

@@ -47,7 +47,7 @@ def calibration():
         calib.Calibration,
         skin=stand_in(je.Skin, name="small", pads=pads, surface=None),
         recon=recon,
-        masks=stand_in(je.PadMasks, areas=areas),
+        masks=stand_in(je.fusion.PadMasks, areas=areas),
         locator=None,
         simulated=True,
     )
@@ -320,7 +320,7 @@ def test_what_is_no_port_is_refused(option, number, capsys):
 
 def test_what_cannot_be_sent_is_refused(calibration):
     with pytest.raises(BridgeError, match="log has no force map"):
-        Bridge(stand_in(calib.LogCalibration), Recorder())
+        Bridge(stand_in(calib.calibration.LogCalibration), Recorder())
     with pytest.raises(ValueError, match="no topic of ROS"):
         Bridge(calibration, Recorder(), prefix="/9")
 

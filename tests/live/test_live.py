@@ -132,7 +132,7 @@ def calibration(monkeypatch, skin):
             surface=None,
         ),
         recon=recon,
-        masks=stand_in(je.PadMasks, weights=weights),
+        masks=stand_in(je.fusion.PadMasks, weights=weights),
         simulated=True,
         pads=stand_in(PadModel, curves=curves, field=None, gains=None, multiple=1.6),
         curves=curves,

@@ -202,7 +202,7 @@ def recorded(tmp_path_factory):
     return folder
 
 
-IMAGES = calib.Recipe(location=calib.PadEdge(), locator=calib.ImageCentroid())
+IMAGES = calib.Recipe(location=calib.PadEdge(), locator=calib.calibration.ImageCentroid())
 CONTACTS = calib.Recipe(location=calib.PadEdge())
 
 

@@ -97,7 +97,7 @@ def calibration(skin):
     return Calibration(
         skin=skin,
         recon=recon,
-        masks=je.PadMasks(jnp.eye(4), recon.areas),
+        masks=je.fusion.PadMasks(jnp.eye(4), recon.areas),
         curves=fitted_curves(4),
         evaluation=evaluation_on(4),
         provenance={"created_utc": "2026-01-01T00:00:00+00:00", "curve": "linear", "sessions": "0123abcd  grid.h5"},

@@ -50,7 +50,7 @@ class ForceEstimate(NamedTuple):
         print(found.contact_force[strongest])  # N of each contact
     """
 
-    map: je.ForceMap
+    map: je.fusion.ForceMap
     force: Any
     standard_error: Any
     valid: Any
@@ -63,7 +63,7 @@ class ForceModel(eqx.Module):
     """The parts of a `Calibration` from which forces are computed, as one pytree for compiled programs."""
 
     recon: je.Reconstructor | je.imaging.IterativeReconstructor
-    masks: je.PadMasks
+    masks: je.fusion.PadMasks
     pads: PadModel
     locator: AbstractLocator | None
 

@@ -79,7 +79,7 @@ def _attributes(cal: "Calibration") -> dict[str, Any]:
     return attrs
 
 
-def _image_arrays(recon: je.Reconstructor | je.imaging.IterativeReconstructor, masks: je.PadMasks) -> Described:
+def _image_arrays(recon: je.Reconstructor | je.imaging.IterativeReconstructor, masks: je.fusion.PadMasks) -> Described:
     numbers = je.imaging.to_numbers(recon)
     return {
         **{f"image/{name}": (array, *je.imaging.NUMBERS[name][1:]) for name, array in numbers.items()},
@@ -200,7 +200,7 @@ def fields_from_archive(archive: Archive) -> dict[str, Any]:
     parts = {
         "skin": skin,
         "recon": recon,
-        "masks": je.PadMasks(masks, recon.areas, recon.shape),
+        "masks": je.fusion.PadMasks(masks, recon.areas, recon.shape),
         **of_pads,
         "evaluation": Evaluation.restore(attrs, arrays, "evaluation_", "presses/"),
         "provenance": provenance,

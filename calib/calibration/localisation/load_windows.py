@@ -173,7 +173,7 @@ Found = tuple[Loads, float]
 
 def _found(
     fitter: je.contacts.LoadFitter,
-    finder: je.ContactFinder,
+    finder: je.contacts.ContactFinder,
     proposal: Proposal | None,
     window: Window,
     channels: np.ndarray,

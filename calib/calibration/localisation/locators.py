@@ -28,7 +28,9 @@ class AbstractLocator(eqx.Module):
     """Estimates the `Places` of the contacts in frames."""
 
     @abc.abstractmethod
-    def __call__(self, dv: Array, image: Array, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks) -> Places:
+    def __call__(
+        self, dv: Array, image: Array, recon: je.imaging.AbstractReconstructor, masks: je.fusion.PadMasks
+    ) -> Places:
         """Places of difference frames (n, readings) V with their images (n, pixels) S."""
 
     @property
@@ -46,7 +48,9 @@ class CentroidLocator(AbstractLocator):
 
     estimator: je.metrics.AbstractEstimator
 
-    def __call__(self, dv: Array, image: Array, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks) -> Places:
+    def __call__(
+        self, dv: Array, image: Array, recon: je.imaging.AbstractReconstructor, masks: je.fusion.PadMasks
+    ) -> Places:
         return single_places(self._position(image, recon), masks.weights.shape[0])
 
     def _position(self, image: Array, recon: je.imaging.AbstractReconstructor) -> Array:
@@ -64,7 +68,7 @@ class CentroidLocator(AbstractLocator):
 class ContactLocator(AbstractLocator):
     """Contacts fitted to the readings; contacts on a pad are weighted by the integrals of their bumps over its mask."""
 
-    finder: je.ContactFinder
+    finder: je.contacts.ContactFinder
 
     @property
     def contacts(self) -> int:
@@ -73,16 +77,20 @@ class ContactLocator(AbstractLocator):
     def single(self) -> "ContactLocator":
         return ContactLocator(replace(self.finder, most=1))
 
-    def __call__(self, dv: Array, image: Array, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks) -> Places:
+    def __call__(
+        self, dv: Array, image: Array, recon: je.imaging.AbstractReconstructor, masks: je.fusion.PadMasks
+    ) -> Places:
         return self.placed(self.finder(dv), recon, masks)
 
-    def contacts_of(self, dv: ArrayLike) -> je.Contacts:
+    def contacts_of(self, dv: ArrayLike) -> je.contacts.Contacts:
         """Contacts of any number of difference frames (n, readings) V, by one program."""
-        found: je.Contacts = _by_rows(self.finder, dv)
+        found: je.contacts.Contacts = _by_rows(self.finder, dv)
         return found
 
     @je.verb
-    def placed(self, found: je.Contacts, recon: je.imaging.AbstractReconstructor, masks: je.PadMasks) -> Places:
+    def placed(
+        self, found: je.contacts.Contacts, recon: je.imaging.AbstractReconstructor, masks: je.fusion.PadMasks
+    ) -> Places:
         """Convert fitted contacts to `Places`; position and width of absent contacts are NaN."""
         position = jnp.where(found.present[..., None], found.position, jnp.nan)
         width = jnp.where(found.present, found.width, jnp.nan)
@@ -181,7 +189,7 @@ def locate(
     locator: AbstractLocator,
     dv: ArrayLike,
     recon: je.imaging.AbstractReconstructor,
-    masks: je.PadMasks,
+    masks: je.fusion.PadMasks,
     image: Array | None = None,
 ) -> Places:
     """`Places` of the contacts in difference frames (n, readings) V.
@@ -190,12 +198,12 @@ def locate(
 
     Example:
         noise, channels = frames[rest].std(0), np.asarray(mine.recon.channels)
-        for choice in (calib.ImageCentroid(je.LevelCentroid(0.5)), calibration.FittedContact(most=1)):
+        for choice in (calib.calibration.ImageCentroid(je.LevelCentroid(0.5)), calibration.FittedContact(most=1)):
             model = je.discretise(je.Scene(mine.skin), je.Fidelity.draft())
             locator = choice.prepare(model, noise, channels)
             print(calibration.LOCATORS.text(choice))
             # m
-            print(calib.locate(locator, dv[strongest : strongest + 1], mine.recon, mine.masks).position)
+            print(calib.calibration.locate(locator, dv[strongest : strongest + 1], mine.recon, mine.masks).position)
     """
     images = recon(jnp.asarray(dv, recon.dtype)) if image is None else image
     frames = np.asarray(dv, images.dtype)

@@ -52,7 +52,7 @@ class Imager:
     """
 
     recon: je.Reconstructor | je.imaging.IterativeReconstructor
-    masks: je.PadMasks
+    masks: je.fusion.PadMasks
     locator: AbstractLocator | None = None
     notes: tuple[str, ...] = ()
 

@@ -136,7 +136,7 @@ def _range(calibration: Calibration) -> np.ndarray:
     return np.where(fitted[:, None], np.stack([low - margin, high + margin], 1), [1.0, -1.0])
 
 
-def _masks(masks: je.PadMasks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _masks(masks: je.fusion.PadMasks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The masks pad by pad, without the pixels beside the pad."""
     weights = np.asarray(masks.weights, float)
     pad, pixel = np.nonzero(weights)

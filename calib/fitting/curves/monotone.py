@@ -83,7 +83,7 @@ class MonotonePolynomial(_RisingFromZero):
     | rise 1, 2, 3 | c_j - c_(j-1); a straight line if equal   | ()    | N    | > 0   |
 
     Example:
-        cubic = fitting.fit_curve(calib.MonotonePolynomial(), pressures[0], forces[0])
+        cubic = fitting.fit_curve(calib.fitting.MonotonePolynomial(), pressures[0], forces[0])
         print(cubic.parameters)  # N
     """
 

@@ -19,7 +19,7 @@ class Places(eqx.Module):
     |-----------|----------------------------------------------------------------------|--------------|------|
     | position  | of each contact, in the flat coordinates of the sheet; NaN: none     | (n, K, 2)    | m    |
     | weight    | share of each contact in what a pad carries; a row of zeros: unknown | (n, K, pads) | 1    |
-    | width     | of its bump, as in `jaxeit.Contacts`; NaN: not known                 | (n, K)       | m    |
+    | width     | of its bump, as in `jaxeit.contacts.Contacts`; NaN: not known                 | (n, K)       | m    |
     | amplitude | of its bump; 0: not known, or none                                   | (n, K)       | S    |
     """
 

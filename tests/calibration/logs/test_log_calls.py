@@ -42,7 +42,7 @@ def test_a_log_goes_through_the_verbs_of_a_skin(log, tmp_path):
     session, sensor = log
     stages = []
     made = calib.calibrate(session, recipe=AFFINE, progress=stages.append)
-    assert isinstance(made, calib.LogCalibration)
+    assert isinstance(made, calib.calibration.LogCalibration)
     assert stages == [FITTING_LOGS]
     np.testing.assert_array_equal(made.model.curve.parameters, sensor.model.curve.parameters)
     stream = session.stream(sensor.stream)

@@ -117,7 +117,7 @@ def test_a_file_gives_back_the_calibration_and_its_forces(few, tmp_path):
     made = calibrated(few[0])
     made.save(tmp_path / "c.h5")
     back = calib.load_calibration(tmp_path / "c.h5")
-    assert isinstance(back, calib.LogCalibration)
+    assert isinstance(back, calib.calibration.LogCalibration)
     with open_session(few[1]) as session:
         stream = session.stream("pressure")
         ours, theirs = (one.predict(stream.time, stream.read()) for one in (made, back))
