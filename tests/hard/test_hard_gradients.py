@@ -45,6 +45,7 @@ HOST = {
     "expected_mesh_nodes": _GEOMETRY,
     "few_choices": _PREPARES,
     "find_misplacement": _PREPARES,
+    "fit_depth": _PREPARES,
     "fit_electrodes": _PREPARES,
     "fit_model_error": _PREPARES,
     "is_covariance": "says yes or no",
