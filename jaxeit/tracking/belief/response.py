@@ -7,7 +7,7 @@ the contacts (`reanalysis`). Derivatives follow the same chain by hand, so that 
 
 import math
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import NamedTuple
 
 import equinox as eqx
@@ -268,29 +268,40 @@ def _pressure_and_slopes(
 def load_slopes(
     load: Float[Array, "6"], points: Float[Array, "n 2"], spreading: Spreading
 ) -> tuple[Float[Array, " n"], Float[Array, "6 n"]]:
-    """`load_pressure` and its slopes in the parameters of the load, by hand, which takes a third of the time."""
-    parts, width_slopes = spreading.parts(load)
-    values, slopes = zip(*(_line_slopes(part, points) for part in parts), strict=True)
-    found = jnp.stack(slopes).at[:, 2].multiply(width_slopes[:, None])
-    return jnp.sum(jnp.stack(values), 0), jnp.sum(found, 0)
+    """`load_pressure` and its slopes in the parameters of the load, by hand, which takes a third of the time.
 
-
-def _line_slopes(
-    load: Float[Array, "6"], points: Float[Array, "n 2"]
-) -> tuple[Float[Array, " n"], Float[Array, "6 n"]]:
-    width, half = jnp.exp(load[2]), jnp.sqrt(load[4:] @ load[4:] + MIN_HALF_LENGTH**2)
+    The parts of a load that is spread have its place and direction, so that only their profiles are summed.
+    """
+    half = jnp.sqrt(load[4:] @ load[4:] + MIN_HALF_LENGTH**2)
     unit, away = (load[4:] / half)[:, None], points.T - load[:2, None]
     along = jnp.sum(unit * away, 0)
     beside, across = away - along * unit, jnp.sum(away**2, 0) - along**2
-    ends, root = (along + half, along - half), math.sqrt(2) * width
-    peak = jnp.exp(load[3] - 0.5 * across / width**2) / (math.sqrt(2 * math.pi) * width * 4 * half)
+    profiles = [_profile(*part, along, across, half) for part in zip(*spreading.parts(load), strict=True)]
+    value, narrow, first, last, by_width = (reduce(jnp.add, each) for each in zip(*profiles, strict=True))
+    by_place = narrow * beside - (first - last) * unit
+    by_half = (narrow * along + first - last) * (beside / half) + (first + last - value / half) * unit
+    return value, jnp.concatenate([by_place, by_width[None], value[None], by_half])
+
+
+def _profile(
+    part: Float[Array, "6"],
+    width_slope: Float[Array, ""],
+    along: Float[Array, " n"],
+    across: Float[Array, " n"],
+    half: Float[Array, ""],
+) -> tuple[Float[Array, " n"], ...]:
+    """Pressure of a part of a load; the same over its variance; slopes by its ends; slope in the load's log width.
+
+    Points are ``along`` the edge from its middle, m, and the root of ``across`` away from it, m^2.
+    """
+    inverse = jnp.exp(-2 * part[2])
+    root = math.sqrt(2) * jnp.exp(part[2])
+    ends = (along + half, along - half)
+    peak = jnp.exp(part[3] - 0.5 * across * inverse) / (4 * math.sqrt(math.pi) * root * half)
     value = peak * (erf(ends[0] / root) - erf(ends[1] / root))
     first, last = (2 / math.sqrt(math.pi) / root * peak * jnp.exp(-((end / root) ** 2)) for end in ends)
-    by_place = value * beside / width**2 - (first - last) * unit
-    by_width = value * (across / width**2 - 1) - (first * ends[0] - last * ends[1])
-    turned = beside / half
-    by_half = (value * along / width**2 + first - last) * turned + (first + last - value / half) * unit
-    return value, jnp.concatenate([by_place, by_width[None], value[None], by_half])
+    by_width = value * (across * inverse - 1) - (first * ends[0] - last * ends[1])
+    return value, value * inverse, first, last, width_slope * by_width
 
 
 def load_pressure(load: Float[Array, "6"], points: Float[Array, "... 2"], spreading: Spreading) -> Float[Array, "..."]:
