@@ -93,13 +93,13 @@ def touches(rng: np.random.Generator, singles: int, others: int, low: np.ndarray
     """All touches of a seed, on a sheet whose corners are at low and high."""
     yield from round_touches(rng, singles, others, DISTANCES, low, high)
     for length in LENGTHS:
-        for middle, along in _lines(rng, others, low, high):
+        for middle, along in lines(rng, others, low, high):
             places = middle + np.linspace(-0.5, 0.5, 9)[:, None] * length * along
-            yield _touch(f"edge, {1e3 * length:.0f} mm", LoadKind.EDGE, places, np.full(9, LOAD / 9))
-    for middle, along in _lines(rng, others, low, high):
+            yield as_touch(f"edge, {1e3 * length:.0f} mm", LoadKind.EDGE, places, np.full(9, LOAD / 9))
+    for middle, along in lines(rng, others, low, high):
         turned = np.exp(2j * np.pi * np.arange(3) / 3) * complex(*along)
         places = middle + TRIANGLE * np.stack([turned.real, turned.imag], 1)
-        yield _touch("three", LoadKind.MORE, places, np.full(3, LOAD))
+        yield as_touch("three", LoadKind.MORE, places, np.full(3, LOAD))
 
 
 def round_touches(
@@ -112,18 +112,19 @@ def round_touches(
 ) -> Iterator[Touch]:
     """Singles, and pairs at some distances."""
     for place in rng.uniform(low + 0.02, high - 0.02, (singles, 2)):
-        yield _touch("one", LoadKind.ONE, place[None], np.array([LOAD]))
+        yield as_touch("one", LoadKind.ONE, place[None], np.array([LOAD]))
     for share in SHARES:
         for distance in distances:
-            for middle, along in _lines(rng, others, low, high):
+            for middle, along in lines(rng, others, low, high):
                 places = middle + np.array([[-0.5], [0.5]]) * distance * along
                 name = f"two, 1:{1 / share:.0f}, {1e3 * distance:.0f} mm"
-                yield _touch(name, LoadKind.TWO, places, LOAD * np.array([1.0, share]))
+                yield as_touch(name, LoadKind.TWO, places, LOAD * np.array([1.0, share]))
 
 
-def _lines(
+def lines(
     rng: np.random.Generator, count: int, low: np.ndarray, high: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Middles (2,) m and directions (2,) anywhere on a sheet."""
     for _ in range(count):
         angle = rng.uniform(0, np.pi)
         yield rng.uniform(low + 0.05, high - 0.05), np.array([np.cos(angle), np.sin(angle)])
@@ -133,7 +134,7 @@ def shaped(rng: np.random.Generator, shape: str, count: int) -> Iterator[Touch]:
     """Single touches of a shape on the testbed."""
     for place in rng.uniform(0.03, 0.17, (count, 2)):
         places, loads = _tip(shape, rng.uniform(0, 2 * np.pi))
-        yield _touch(shape, LoadKind.ONE, place + places, LOAD * loads / loads.sum())
+        yield as_touch(shape, LoadKind.ONE, place + places, LOAD * loads / loads.sum())
 
 
 def _tip(shape: str, angle: float) -> tuple[np.ndarray, np.ndarray]:
@@ -150,7 +151,8 @@ def _tip(shape: str, angle: float) -> tuple[np.ndarray, np.ndarray]:
     return places, 1 + (TILT * along if shape == "tilted" else 0 * along)
 
 
-def _touch(name: str, kind: LoadKind, places: np.ndarray, loads: np.ndarray) -> Touch:
+def as_touch(name: str, kind: LoadKind, places: np.ndarray, loads: np.ndarray) -> Touch:
+    """A touch of fewer than `TIPS` tips."""
     spare = TIPS - len(places)
     return Touch(name, kind, np.concatenate([places, np.repeat(places[-1:], spare, 0)]), np.pad(loads, (0, spare)))
 
@@ -162,7 +164,7 @@ def drawn(rng: np.random.Generator, count: int, low: np.ndarray, high: np.ndarra
         kind = LoadKind(rng.choice(len(LoadKind), p=known.prior))
         places, loads = _drawn(rng, kind, known, low, high)
         if (places >= low).all() and (places <= high).all():
-            found.append(_touch(kind.name.lower(), _counted(kind, places, known), places, loads))
+            found.append(as_touch(kind.name.lower(), _counted(kind, places, known), places, loads))
     return found
 
 
@@ -401,7 +403,7 @@ def measure_bound(run: Run) -> Iterator[Row]:
         given += [(f"two, 1:1, {1e3 * distance:.0f} mm", LoadKind.TWO, distance) for distance in distances]
         odds = {
             name: np.array(
-                [several_odds(fitter, kind, m, along, size, rng) for m, along in _lines(rng, count, low, high)]
+                [several_odds(fitter, kind, m, along, size, rng) for m, along in lines(rng, count, low, high)]
             )
             for name, kind, size in given
         }

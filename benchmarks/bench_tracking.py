@@ -18,12 +18,13 @@ import time
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2, norm
 
 import jaxeit as je
 from calib.live.follower import PIECES
-from jaxeit.tracking import Tracker, Tracking, prepare_tracker
+from jaxeit.tracking import Tracker, TrackerSettings, Tracking, prepare_tracker
 
 from .bench_loads import NOISES, SHAPES, TIP_SPREAD, WITHIN, Touch, shaped
 from .clock import seconds
@@ -37,20 +38,22 @@ DISTANCES, LENGTHS = (0.015, 0.02, 0.025, 0.03, 0.04), (0.03, 0.04, 0.06)  # m
 GAP, SPEED = 0.04, 0.1  # m between contacts that cross, and m/s
 TIPS = 9  # of an edge
 PAD_ERROR = (0.03, 0.1)  # relative, and N
+CELLS = 40  # along each side of a pad, whose forces are summed
 INSIDE = float(chi2.ppf(0.9, 2))
 HELD, FIRST_SHAPES = 16, 620  # frames of a tip of another shape; first seed of their skins
 PRESSES = 40  # of a seed, one after the other, from which the gain of the contact layer is learned
 
 
 class Scene(NamedTuple):
-    """Name, places (frames, k, 2) m and loads (frames, k) N of tips, whether they are one edge, and the standard
-    deviation, m, to which the pad spreads each."""
+    """Name, places (frames, k, 2) m and loads (frames, k) N of tips, whether they are one contact, how the pad spreads
+    each (to a standard deviation, m, or as a half-space does), and their diameter, m."""
 
     name: str
     places: np.ndarray
     loads: np.ndarray
     edge: bool = False
-    spread: float = SPREAD
+    spread: float | je.effects.IndentationSpreading = SPREAD
+    diameter: float = 0.02
 
     def truth(self, frame: int) -> np.ndarray:
         """Places (n, 2) m of the contacts of a frame: of an edge, its middle."""
@@ -67,7 +70,7 @@ class Shown(NamedTuple):
     errors: np.ndarray
 
 
-def _force(frames: int, begin: int, end: int | None = None) -> np.ndarray:
+def rising(frames: int, begin: int, end: int | None = None) -> np.ndarray:
     """Force of a tip that presses between two frames, (frames,) N."""
     time = np.arange(frames)
     down = 1.0 if end is None else np.clip((end - time) / (RATE * RISE), 0, 1)
@@ -83,7 +86,7 @@ def sequence(rng: np.random.Generator, distance: float) -> Scene:
     """A tip, and 0.15 s later a second one at a distance."""
     middle, along = _line(rng)
     places = middle + np.array([[-0.5], [0.5]]) * distance * along
-    loads = np.stack([_force(40, 2), _force(40, 17)], 1)
+    loads = np.stack([rising(40, 2), rising(40, 17)], 1)
     return Scene(f"two in sequence, {1e3 * distance:.0f} mm", np.broadcast_to(places, (40, 2, 2)), loads)
 
 
@@ -96,7 +99,7 @@ def crossing(rng: np.random.Generator) -> Scene:
         np.stack([left + run, np.full(90, right - GAP / 2)], 1),
         np.stack([left - run, np.full(90, right + GAP / 2)], 1),
     ]
-    loads = np.stack([_force(90, 2), _force(90, 5)], 1)
+    loads = np.stack([rising(90, 2), rising(90, 5)], 1)
     return Scene("crossing at 40 mm, 100 mm/s", np.stack(there, 1), loads)
 
 
@@ -104,7 +107,7 @@ def edge(rng: np.random.Generator, length: float) -> Scene:
     """A row of tips pressed at once."""
     middle, along = _line(rng)
     places = middle + np.linspace(-0.5, 0.5, TIPS)[:, None] * length * along
-    loads = np.repeat(_force(25, 2)[:, None] / TIPS, TIPS, 1)
+    loads = np.repeat(rising(25, 2)[:, None] / TIPS, TIPS, 1)
     return Scene(f"edge, {1e3 * length:.0f} mm", np.broadcast_to(places, (25, TIPS, 2)), loads, edge=True)
 
 
@@ -112,23 +115,47 @@ def presses(rng: np.random.Generator, count: int) -> Scene:
     """Presses at random places, one after the other."""
     frames = 26
     places = np.repeat(rng.uniform(0.02, 0.18, (count, 1, 2)), frames, 0)
-    return Scene("presses", places, np.tile(_force(frames, 1, 23), count)[:, None])
+    return Scene("presses", places, np.tile(rising(frames, 1, 23), count)[:, None])
 
 
 def pad_loads(skin: je.Skin, scene: Scene) -> np.ndarray:
-    """Force on each pad, (frames, pads) N: of Gaussian loads on rectangles."""
+    """Force on each pad, (frames, pads) N, of which each is a rectangle."""
     out = []
     for pad in skin.pads:
         low, high = np.min(pad.outline, 0), np.max(pad.outline, 0)
-        share = norm.cdf((high - scene.places) / scene.spread) - norm.cdf((low - scene.places) / scene.spread)
-        out.append((share.prod(2) * scene.loads).sum(1))
+        if isinstance(scene.spread, float):
+            share = norm.cdf((high - scene.places) / scene.spread) - norm.cdf((low - scene.places) / scene.spread)
+            on_pad = share.prod(2)
+        else:
+            on_pad = _half_space_share(scene, scene.spread, low, high)
+        out.append((on_pad * scene.loads).sum(1))
     return np.stack(out, 1)
+
+
+def _half_space_share(
+    scene: Scene, spread: je.effects.IndentationSpreading, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Share (frames, k) of each load of a half-space on a rectangle, by the midpoint rule."""
+    middles = (np.arange(CELLS) + 0.5) / CELLS
+    points = jnp.asarray(low + np.stack(np.meshgrid(middles, middles), -1).reshape(-1, 2) * (high - low))
+    places, index = np.unique(scene.places.reshape(-1, 2), axis=0, return_inverse=True)
+    ideal, width = jnp.zeros(len(points)), jnp.asarray(scene.diameter)
+    means = [spread(ideal, je.effects.Indenter(jnp.asarray(place), width), points).mean() for place in places]
+    share: np.ndarray = np.prod(high - low) * np.array(means)[index.ravel()].reshape(scene.loads.shape)
+    return share
 
 
 class Bench:
     """A skin of one seed, its tracker, and how frames of a scene are simulated on it."""
 
-    def __init__(self, model: je.Model, seed: int, decibels: int = 60, known: bool = True):
+    def __init__(
+        self,
+        model: je.Model,
+        seed: int,
+        decibels: int = 60,
+        known: bool = True,
+        settings: TrackerSettings | None = None,
+    ):
         self.skin, self._seed, self._effects = je.load_skin("testbed"), seed, uneven(seed)
         self.rng = np.random.default_rng([seed, 7])
         blank = pressed(self._effects, np.full((1, 1, 2), 0.1), np.zeros((1, 1)))
@@ -136,11 +163,12 @@ class Bench:
         untouched, _ = blank.frames(self.rng)
         self.noise = blank.std
         sheet = je.fit_background(model, untouched) if known else None
-        self.tracker: Tracker = prepare_tracker(model, self.skin, noise=self.noise, sigma=sheet)
+        self.tracker: Tracker = prepare_tracker(model, self.skin, settings, noise=self.noise, sigma=sheet)
 
     def changes(self, scene: Scene) -> np.ndarray:
         """How the readings change in the frames of a scene, without noise, (frames, readings) V."""
-        return pressed(self._effects, scene.places, scene.loads, spread=scene.spread).change
+        how = {"spread": scene.spread, "diameters": scene.diameter}
+        return pressed(self._effects, scene.places, scene.loads, **how).change
 
     def frames(self, scene: Scene, changes: np.ndarray | None = None, pads: bool = True) -> list[Shown]:
         """What the tracker is shown of a scene, whose `changes` may be given; without pads it is told no forces."""
@@ -251,24 +279,31 @@ def schedules(run: Run) -> Iterator[Row]:
 
 def times(run: Run) -> Iterator[Row]:
     """Wall and processor time of ordinary frames with one and two contacts, in turn, and of pieces of looks."""
-    bench = Bench(fit_model(), 700)
     (repeats,) = run.sizes((300,), (3,))
     scene = sequence(np.random.default_rng(700), 0.04)
-    frames = bench.frames(scene)
-    known = {len(now.numbers): (now, frames[number]) for number, now, _ in bench.followed(frames)}
-    spent: dict[int, list[tuple[float, float]]] = {count: [] for count in (1, 2)}
-    for _ in range(repeats):
-        for count, found in spent.items():
-            now, shown = known[count]
-            begin = time.process_time()
-            wall, _ = seconds(lambda n=now, f=shown: bench.tracker.step(n, *f, whole=False))
-            found.append((wall, time.process_time() - begin))
+    (spent,) = step_times([Bench(fit_model(), 700)], scene, repeats)
     rows = []
-    for count, found in spent.items():
-        wall, used = 1e3 * np.transpose(found)
+    for count, (wall, used) in spent.items():
         row = {"contacts": count, "p50_ms": np.median(wall), "p99_ms": np.quantile(wall, 0.99)}
         rows.append(row | {"processor_p50_ms": np.median(used), "processor_p10_ms": np.quantile(used, 0.1)})
     yield {"times": [rounded(row, 3) for row in rows]}
+
+
+def step_times(benches: Sequence[Bench], scene: Scene, repeats: int) -> list[dict[int, np.ndarray]]:
+    """Wall and processor time (2, repeats), ms, of ordinary frames with one and two contacts; all benches in turn."""
+    known = []
+    for bench in benches:
+        frames = bench.frames(scene)
+        known.append({len(now.numbers): (now, frames[number]) for number, now, _ in bench.followed(frames)})
+    spent: list[dict[int, list[tuple[float, float]]]] = [{count: [] for count in (1, 2)} for _ in benches]
+    for _ in range(repeats):
+        for count in (1, 2):
+            for bench, states, found in zip(benches, known, spent, strict=True):
+                now, shown = states[count]
+                begin = time.process_time()
+                wall, _ = seconds(lambda b=bench, n=now, f=shown: b.tracker.step(n, *f, whole=False))
+                found[count].append((wall, time.process_time() - begin))
+    return [{count: 1e3 * np.transpose(of_count) for count, of_count in found.items()} for found in spent]
 
 
 def learning(run: Run) -> Iterator[Row]:

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 import jaxeit as je
 from calib.calibration.localisation.load_windows import LOAD_FIDELITY
@@ -186,29 +187,33 @@ def pressed(
     places: np.ndarray,
     loads: np.ndarray,
     edge_length: float = 0.026,
-    spread: float = 0.012,
+    spread: float | je.effects.IndentationSpreading = 0.012,
     skin: str | je.Skin = "testbed",
     law: tuple[float, float, float] = (1.0, 20e3, 1.0),
+    diameters: ArrayLike = 0.02,
 ) -> Pressed:
-    """A skin pressed by tips of 20 mm at (presses, k, 2) m at once with (presses, k) N, on a mesh of its own.
+    """A skin pressed by tips at (presses, k, 2) m at once with (presses, k) N, on a mesh of its own.
 
-    The pad spreads each tip to a Gaussian of standard deviation ``spread``, m; ``law`` holds amplitude, half pressure
-    (Pa) and exponent of `ContactPiezoresistance`.
+    The pad spreads each tip to a Gaussian of standard deviation ``spread``, m, or is a half-space; ``law`` holds
+    amplitude, half pressure (Pa) and exponent of `ContactPiezoresistance`. ``diameters``, m, are those of the tips of
+    each press, (presses,), or of all.
     """
-    effects = (je.effects.LoadSpreading(spread), *effects, je.effects.ContactPiezoresistance(*law))
+    pad = je.effects.LoadSpreading(spread) if isinstance(spread, float) else spread
+    effects = (pad, *effects, je.effects.ContactPiezoresistance(*law))
     scene = je.Scene(je.load_skin(skin) if isinstance(skin, str) else skin, effects)
     model = je.discretise(scene, je.Fidelity.standard(edge_length=edge_length))
     untouched = np.asarray(je.forward(model))
-    touched = np.asarray(_touched(model, jnp.asarray(places), jnp.asarray(loads)))
+    tips = jnp.broadcast_to(jnp.asarray(diameters, model.dtype), len(places))
+    touched = np.asarray(_touched(model, jnp.asarray(places), jnp.asarray(loads), tips))
     return Pressed.of(untouched, touched - untouched)
 
 
-def _forwards(model: je.Model, places: jax.Array, loads: jax.Array) -> jax.Array:
+def _forwards(model: je.Model, places: jax.Array, loads: jax.Array, diameters: jax.Array) -> jax.Array:
     def frame(press):
-        loads_there = jax.vmap(lambda place: je.model.load_spread(model, place, 0.02))(press[0])
+        loads_there = jax.vmap(lambda place: je.model.load_spread(model, place, press[2]))(press[0])
         return je.forward(model, je.conductivity(model, press[1] @ loads_there))
 
-    return jax.lax.map(frame, (places, loads))
+    return jax.lax.map(frame, (places, loads, diameters))
 
 
 _jit: Any = eqx.filter_jit  # its type leaves out what it hands on to jax.jit
