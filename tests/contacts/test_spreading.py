@@ -1,5 +1,6 @@
 """Loads that the skin spreads, against the half-space that the sum of Gaussians stands for."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,8 +8,13 @@ import pytest
 from scipy.integrate import quad
 
 import jaxeit as je
+from jaxeit.contacts.loads.fits.comparison import load_shape
+from jaxeit.contacts.loads.fits.kinds import FrameFits
 from jaxeit.contacts.loads.pressure import spot
+from jaxeit.contacts.loads.search import FrameSearch
 from jaxeit.contacts.loads.spreading import Spreading
+
+from .touches import frames_of, single
 
 DEPTH = 0.01  # m
 
@@ -72,3 +78,24 @@ def test_a_width_is_that_on_the_sheet():
     tip = np.exp(2 * np.asarray(rows[:, 2])) - np.asarray(spreading.variances)
     assert np.ptp(tip) < 1e-12 * tip[0]  # the same for all parts
     assert tip[0] == pytest.approx(width**2 - float(spreading.core), rel=0.03)
+
+
+def test_a_load_of_a_half_space_is_explained_at_its_depth(ready):
+    """To the noise, and far better than by a Gaussian, whose shape may differ by its moments."""
+    fitter, places = ready[0], np.array([[0.13, 0.05], [0.09, 0.09]])
+    frames, _, _ = frames_of(
+        [single(*place) for place in places], spread=je.effects.IndentationSpreading(DEPTH), diameters=0.01
+    )
+    deep = eqx.tree_at(lambda f: f.belief.sheet.spreading, fitter, Spreading.at_depth(DEPTH, fitter.belief.low.dtype))
+    flat, spread = ([one_load(each, frame) for frame in frames] for each in (fitter, deep))
+    assert max(shape.misfit for shape in spread) < 1.1
+    falls = [one.misfit - other.misfit for one, other in zip(flat, spread, strict=True)]
+    assert min(falls) * len(fitter.whitened(frames[0], 0)) > 30  # of chi-square, with as many parameters
+    away = [np.linalg.norm(shape.position[0] - place) for shape, place in zip(spread, places, strict=True)]
+    assert max(away) < 1e-3
+
+
+def one_load(fitter, frame):
+    """The single load that explains a frame best."""
+    fit = FrameFits(fitter.belief, fitter.whitened(frame, 0))
+    return load_shape(fit, FrameSearch(fit, fitter.starts, None).one())
