@@ -15,6 +15,7 @@ from benchmarks import (
     bench_calibration,
     bench_contact_law,
     bench_growth,
+    bench_half_space,
     bench_learning,
     bench_loads,
     bench_pipeline,
@@ -359,6 +360,17 @@ def test_smoke_loads():
     for part in ("coverage", "ellipses"):
         assert {row["case"].split(",")[0] for row in data[part]} == set(bench_loads.SHAPES)
     assert all(row["outside"] >= row["beyond"] >= 0 for row in data["ellipses_cases"])
+
+
+@pytest.mark.slow
+def test_smoke_half_space():
+    data = bench_half_space.main(["--smoke"])
+    for part, name in (("frames", "touch"), ("tracked", "scene")):
+        assert {row[name].split(",")[0].split()[0] for row in data[part]} == {"one", "two", "edge"}
+        assert {row["load"] for row in data[part]} == set(bench_half_space.WAYS)
+        assert all(0 <= row["told"] <= 1 and row["error_mm"] > 0 for row in data[part])
+    assert [row["contacts"] for row in data["times"]] == [1, 2]
+    assert all(row["wall_ratio"] > 0 for row in data["times"])
 
 
 @pytest.mark.slow
