@@ -77,7 +77,7 @@ class EventHypotheses:
         self,
         now: Hypothesis,
         begun: int,
-        place: Float[np.ndarray, "2"],
+        places: Sequence[Float[np.ndarray, "2"]],
         alternatives: Sequence[Float[np.ndarray, "2"]],
         seconds: float,
     ) -> Iterator[Hypothesis]:
@@ -85,16 +85,18 @@ class EventHypotheses:
 
         Args:
             begun: number of contacts so far.
-            place: position of the atom that explains most of the innovation, m.
-            alternatives: the same of the innovation without contact k, for each contact.
+            places: positions at which a contact may have begun, m, the most likely one first.
+            alternatives: position of the atom that explains most of the innovation without contact k, m, for each
+                contact.
         """
         event_prior, birth_prior, count = self.event_log_prior(seconds), self.birth_log_prior(seconds), len(now.numbers)
         if count < self._settings.most:
-            belief = self.with_contact(now.belief, place)
-            yield Hypothesis(belief, (*now.numbers, begun + 1), (*now.edges, False), birth_prior)
+            for place in places:
+                belief = self.with_contact(now.belief, place)
+                yield Hypothesis(belief, (*now.numbers, begun + 1), (*now.edges, False), birth_prior)
         if count:
             yield now._replace(belief=allow_jumps(now.belief), prior=event_prior)
-            distances = np.asarray(now.belief.contacts)[:, :2] - place
+            distances = np.asarray(now.belief.contacts)[:, :2] - places[0]
             yield from now.as_edge(int(np.argmin(np.linalg.norm(distances, axis=1))), event_prior)
         for k in range(count):
             yield now.without(k, event_prior)

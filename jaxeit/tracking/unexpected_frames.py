@@ -17,9 +17,10 @@ has happened, these frames are followed, and looked into, one after the other, u
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
-from .belief.programs import Programs
-from .belief.state import CONTACT_SIZE, Update
+from .belief.programs import MIN_START_DISTANCE, Programs
+from .belief.state import CONTACT_SIZE, Belief, Update
 from .events import EventHypotheses, Hypothesis
 from .tracks import MAX_PATIENCE, PATIENCE, Backlog, Look, Observation, Tracking, Trial
 
@@ -156,12 +157,22 @@ def _is_explained(careful: Update, size: int, log_prior: float) -> bool:
 
 
 def _event_trials(look: Look, careful: Update, programs: Programs, events: EventHypotheses) -> tuple[Trial, ...]:
-    """Trials of the events that may have happened."""
+    """Trials of the events that may have happened.
+
+    A contact may have begun where most is left of the frame by the contacts before it, or where the frame shows more
+    than they had predicted: towards a strong new contact they move, and leave of it what lies elsewhere.
+    """
     before, observation = _unchanged(look.before), look.observation
-    place = programs.birth_position(careful.belief, observation.dv, observation.pads)
-    others = [before.without(k, 0.0).belief for k in range(len(before.numbers))]
-    alternatives = [programs.birth_position(belief, observation.dv, observation.pads) for belief in others]
-    return tuple(map(Trial, events.hypotheses(before, look.before.begun, place, alternatives, observation.seconds)))
+
+    def position(belief: Belief) -> Float[np.ndarray, "2"]:
+        return programs.birth_position(belief, observation.dv, observation.pads)
+
+    places = [position(careful.belief)]
+    excess = programs.excess_position(before.belief, observation.dv, observation.pads)
+    if excess is not None and np.linalg.norm(excess - places[0]) >= MIN_START_DISTANCE:
+        places.insert(0, excess)
+    alternatives = [position(before.without(k, 0.0).belief) for k in range(len(before.numbers))]
+    return tuple(map(Trial, events.hypotheses(before, look.before.begun, places, alternatives, observation.seconds)))
 
 
 def _conclude(look: Look, trial: Trial, programs: Programs) -> Update:

@@ -242,6 +242,7 @@ def page(calibration):
         yield found
 
 
+@needs_browser
 def test_before_the_first_result_the_page_says_what_is_waited_for(browser, calibration):
     control = LiveControl()
     with Page(calibration, control) as waiting, browser.open(waiting.url, 1280) as tab:

@@ -1,13 +1,14 @@
 """Looks into unexpected frames, piece by piece: a bounded number of solves in each frame, and the same contacts."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxeit.tracking.belief.frame_update import MAX_STEPS, PIECE_STEPS
-from jaxeit.tracking.belief.programs import Programs
+from jaxeit.tracking.belief.programs import MIN_START_DISTANCE, Programs
 from jaxeit.tracking.belief.state import Pads
 from jaxeit.tracking.events import allow_jumps
 from jaxeit.tracking.tracks import MAX_PATIENCE, PATIENCE, Observation
@@ -45,6 +46,10 @@ class CountingPrograms(Programs):
     def birth_position(self, *args):
         self.evaluations += 1
         return super().birth_position(*args)
+
+    def excess_position(self, *args):
+        self.evaluations += 1
+        return super().excess_position(*args)
 
 
 def truth(k):
@@ -97,6 +102,16 @@ def test_a_look_ends_and_a_frame_is_looked_into_again_only_if_it_is_unexpected(f
     looking = [state.backlog is not None for state in followed[0]]
     assert looking[8]
     assert not all(looking[12:47])
+
+
+def test_a_contact_may_begin_where_a_frame_shows_more_than_predicted(tracker, frame_of):
+    """Not where it shows less, as under a contact that has lifted."""
+    now, one, other = tracker.start(), load(0.06, 0.08, 10.0), load(0.06, 0.11, 20.0)
+    for _ in range(4):
+        now = tracker.step(now, frame_of([one]), SECONDS)
+    show = partial(tracker.programs.excess_position, now.belief, pads=tracker.pads(None, None))
+    assert np.linalg.norm(show(dv=tracker.frame(frame_of([one, other]))) - other[:2]) < MIN_START_DISTANCE
+    assert show(dv=tracker.frame(frame_of([load(0.06, 0.08, 1e-6)]))) is None
 
 
 def test_a_contact_that_is_elsewhere_keeps_its_number(tracker, frame_of):

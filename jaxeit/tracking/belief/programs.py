@@ -77,6 +77,14 @@ class Programs:
         """Most probable position of a new contact, by the innovation of a frame, m."""
         return self.matched_position(self.innovation(belief, dv, pads))
 
+    def excess_position(
+        self, belief: Belief, dv: Float[np.ndarray, " readings"], pads: Pads
+    ) -> Float[np.ndarray, "2"] | None:
+        """Position at which a frame shows more than was predicted, m; None where what it shows most is less."""
+        score = self._atoms @ self.innovation(belief, dv, pads)
+        place = int(np.argmax(np.abs(score)))
+        return self._starts[place] if score[place] > 0 else None
+
     def matched_position(self, innovation: Float[np.ndarray, " r"]) -> Float[np.ndarray, "2"]:
         """Position of the atom that explains most of an innovation, by a matched filter, m."""
         place: np.ndarray = self._starts[int(np.argmax(self._atoms @ innovation))]
