@@ -153,5 +153,10 @@ def render_layer(layer: LearnedLayer, image: je.imaging.AbstractReconstructor) -
     known = np.median(deviation) / np.median(LearnedLayer.unknown(layer.field).at(np.asarray(image.centres, float))[1])
     return (
         f"contact layer: gain {np.exp(mean).min():.2f} to {np.exp(mean).max():.2f}, learned from {layer.contacts} "
-        f"contacts; its uncertainty is {100 * known:.0f} % of that before any contact (median over the sheet)"
+        f"contacts{_under_depth(layer)}; its uncertainty is {100 * known:.0f} % of that before any contact (median "
+        "over the sheet)"
     )
+
+
+def _under_depth(layer: LearnedLayer) -> str:
+    return f", whose loads spread as at a depth of {1e3 * layer.field.depth:.1f} mm" if layer.field.depth else ""

@@ -291,6 +291,8 @@ def test_a_line_tells_how_much_is_known(calibration, layer):
     known = LearnedLayer.normal(exact, layer.mean, 0.25 * np.eye(size), 7)
     line = render_layer(known, calibration.recon)
     assert "learned from 7 contacts; its uncertainty is 50 % of that before any contact" in line
+    deep = replace(known, field=replace(known.field, depth=0.0094))
+    assert "7 contacts, whose loads spread as at a depth of 9.4 mm; its" in render_layer(deep, calibration.recon)
 
 
 def test_frames_without_rest_are_not_followed(calibration, session):

@@ -237,6 +237,8 @@ class _Tracks:
         except NotFollowed as error:
             self._why = f"contacts: none followed: {error}"
             return
+        depth = np.asarray(tracker.field.depth)
+        writer.add(TRACKS + "depth", depth, "m", "of the sheet, by which loads were taken to spread; 0: Gaussian loads")
         for name, about in TRACK_ARRAYS.items():
             writer.add_rows(TRACKS + name, *about)
 
