@@ -28,6 +28,10 @@ from .tracks import MAX_PATIENCE, PATIENCE, Backlog, Look, Observation, Tracking
 FAINT_SIGNAL, FAINT_FRAMES = 4.0, 2
 # Smallest signal-to-noise ratio of a contact that is born beside others, and its smallest share of that of all others.
 MIN_BIRTH_SIGNAL, MIN_BIRTH_SHARE = 12.0, 0.05
+# Smallest distance, m, from contacts at which what a frame shows more than predicted may be a new one.
+MIN_BIRTH_DISTANCE = 0.012
+# Number of frames without a look, after which contacts are settled.
+SETTLED_FRAMES = 5
 # Standard deviation of the log of a force above which a contact is doubtful, and rate of recounts over that of looks
 # into a frame that no event explains.
 DOUBTFUL_STD, RECOUNT_RATE = 0.5, 4
@@ -160,7 +164,8 @@ def _event_trials(look: Look, careful: Update, programs: Programs, events: Event
     """Trials of the events that may have happened.
 
     A contact may have begun where most is left of the frame by the contacts before it, or where the frame shows more
-    than they had predicted: towards a strong new contact they move, and leave of it what lies elsewhere.
+    than they had predicted: towards a strong new contact they move, and leave of it what lies elsewhere. What a frame
+    shows more near them, or while they begin, is their own growth: an edge may have been taken for round.
     """
     before, observation = _unchanged(look.before), look.observation
 
@@ -168,11 +173,22 @@ def _event_trials(look: Look, careful: Update, programs: Programs, events: Event
         return programs.birth_position(belief, observation.dv, observation.pads)
 
     places = [position(careful.belief)]
-    excess = programs.excess_position(before.belief, observation.dv, observation.pads)
+    excess = None
+    if look.before.since >= SETTLED_FRAMES:
+        excess = programs.excess_position(before.belief, observation.dv, observation.pads)
     if excess is not None and np.linalg.norm(excess - places[0]) >= MIN_START_DISTANCE:
-        places.insert(0, excess)
+        away = _distances(np.asarray(before.belief.contacts), excess)
+        places = [excess, *places] if (away >= MIN_BIRTH_DISTANCE).all() else places
     alternatives = [position(before.without(k, 0.0).belief) for k in range(len(before.numbers))]
     return tuple(map(Trial, events.hypotheses(before, look.before.begun, places, alternatives, observation.seconds)))
+
+
+def _distances(contacts: Float[np.ndarray, "K 8"], place: Float[np.ndarray, "2"]) -> Float[np.ndarray, " K"]:
+    """Distances of a place from contacts, m; from the nearest point of an edge."""
+    away, half = place - contacts[:, :2], contacts[:, 4:6]
+    along = np.clip((away * half).sum(1) / np.maximum((half**2).sum(1), np.finfo(half.dtype).tiny), -1, 1)
+    found: np.ndarray = np.linalg.norm(away - along[:, None] * half, axis=1)
+    return found
 
 
 def _conclude(look: Look, trial: Trial, programs: Programs) -> Update:
