@@ -21,8 +21,6 @@ DEVIATIONS = (0.34448759, 0.54881109, 0.94870602, 2.04799112)
 SHARES = (0.13106788, 0.45236645, 0.33212127, 0.0844444)
 # Standard deviation, over the depth, of the single Gaussian that comes nearest.
 CORE_DEVIATION = 0.62141334
-
-
 # Variance of the narrowest tip, over that of the single Gaussian: towards it the width of a load loses its effect.
 NARROWEST = 0.1
 
