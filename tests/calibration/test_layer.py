@@ -49,6 +49,7 @@ class FakeTracker(Tracker):
 
     def __init__(self, tells):
         self.tells, self.started, self.asked, self.steps = tells, [], [], 0
+        self.field = stand_in(GainField, depth=0.0094)
 
     def start(self, layer=None):
         self.started.append(layer)
@@ -242,6 +243,8 @@ def test_the_commands_learn_keep_and_use_the_layer(calibration, presses, tracker
     assert f"force without pads: as the model tells it; {len(PLACES)} contacts do not speak for another law" in told
     assert main(["apply", new, str(presses), "-o", out, "--track"]) == 0
     assert tracker.started[-1].contacts == len(PLACES)
+    with h5py.File(out) as file:
+        assert file["tracks/depth"][()] == tracker.field.depth
     assert main(["recalibrate", new, str(presses), "-o", out, "--learn-layer", "--json"]) == 2
     assert "has moved this calibration before" in capsys.readouterr().err
     later = shutil.copy(presses, tmp_path / "later.h5")

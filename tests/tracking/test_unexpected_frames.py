@@ -104,16 +104,6 @@ def test_a_look_ends_and_a_frame_is_looked_into_again_only_if_it_is_unexpected(f
     assert not all(looking[12:47])
 
 
-def test_a_contact_may_begin_where_a_frame_shows_more_than_predicted(tracker, frame_of):
-    """Not where it shows less, as under a contact that has lifted."""
-    now, one, other = tracker.start(), load(0.06, 0.08, 10.0), load(0.06, 0.11, 20.0)
-    for _ in range(4):
-        now = tracker.step(now, frame_of([one]), SECONDS)
-    show = partial(tracker.programs.excess_position, now.belief, pads=tracker.pads(None, None))
-    assert np.linalg.norm(show(dv=tracker.frame(frame_of([one, other]))) - other[:2]) < MIN_START_DISTANCE
-    assert show(dv=tracker.frame(frame_of([load(0.06, 0.08, 1e-6)]))) is None
-
-
 def test_a_contact_that_is_elsewhere_keeps_its_number(tracker, frame_of):
     """Farther than a fit from its place would find it, and no second contact begins beside it."""
     now = tracker.start()
@@ -285,3 +275,13 @@ def test_events_are_asked_about_only_where_contacts_leave_something(tracker, fra
         asked = asked or look.trials is not None
     assert asked == second
     assert len(look.after.numbers) == 1 + second
+
+
+def test_a_contact_may_begin_where_a_frame_shows_more_than_predicted(tracker, frame_of):
+    """Not where it shows less, as under a contact that has lifted."""
+    now, one, other = tracker.start(), load(0.06, 0.08, 10.0), load(0.06, 0.11, 20.0)
+    for _ in range(4):
+        now = tracker.step(now, frame_of([one]), SECONDS)
+    show = partial(tracker.programs.excess_position, now.belief, pads=tracker.pads(None, None))
+    assert np.linalg.norm(show(dv=tracker.frame(frame_of([one, other]))) - other[:2]) < MIN_START_DISTANCE
+    assert show(dv=tracker.frame(frame_of([load(0.06, 0.08, 1e-6)]))) is None
