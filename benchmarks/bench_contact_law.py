@@ -118,6 +118,14 @@ SCENES: dict[str, Callable[[je.Model, int, int], Skin]] = {
 }
 
 
+def as_presses_tell(prepare: Callable[..., Tracker], *presses: np.ndarray) -> Tracker:
+    """The tracker whose loads spread and whose model errs as presses tell, as `live` prepares it."""
+    tracker = prepare()
+    if depth := fit_depth(tracker, *presses):
+        tracker = prepare(TrackerSettings(loads=LoadSettings(depth=depth)))
+    return fit_model_error(tracker, *presses)
+
+
 class Session:
     """A skin in use: presses that teach, and others that are told by their readings alone."""
 
@@ -125,10 +133,7 @@ class Session:
         self.skin, self.rng = skin, np.random.default_rng([seed, 29])
         prepare = partial(prepare_tracker, model, je.load_skin("testbed"), noise=skin.noise, untouched=skin.untouched)
         forces, errors = self.told(skin.pads[:probes])
-        presses = self.noisy(skin.changes[:probes]), forces, errors
-        self.depth = fit_depth(prepare(), *presses)
-        settings = TrackerSettings(loads=LoadSettings(depth=self.depth))
-        self.tracker: Tracker = fit_model_error(prepare(settings), *presses)
+        self.tracker: Tracker = as_presses_tell(prepare, self.noisy(skin.changes[:probes]), forces, errors)
 
     def noisy(self, changes: np.ndarray) -> np.ndarray:
         """Frames with their noise."""
@@ -196,7 +201,7 @@ def one_scene(run: Run, scene: str) -> Iterator[Row]:
             for press, pads in product(range(max(stages) + 1, len(skin.forces)), (NONE, DEAD)):
                 for way, each in zip(("gain", "law"), session.alone(press, layer, law, pads), strict=True):
                     rows.append(about | {"way": way, "pads": pads} | judged(each, skin.forces[press]))
-        depth = f"{1e3 * session.depth:.1f} mm"
+        depth = f"{1e3 * session.tracker.field.depth:.1f} mm"
         print(f"{scene}, skin {seed}: depth {depth}, {law.mean.round(2)}, evidence {law.evidence:.1f}", flush=True)
     yield {
         scene: [

@@ -36,20 +36,10 @@ from scipy.stats import chisquare
 
 import jaxeit as je
 from calib.calibration.localisation.learned.law_lessons import updated_law
-from jaxeit.contacts import LoadSettings
-from jaxeit.tracking import (
-    ContactLaw,
-    LearnedLayer,
-    Tracker,
-    TrackerSettings,
-    Tracking,
-    fit_depth,
-    fit_model_error,
-    prepare_tracker,
-)
+from jaxeit.tracking import ContactLaw, LearnedLayer, Tracker, Tracking, fit_model_error, prepare_tracker
 from jaxeit.tracking.belief import PRESS_VARIANCES
 
-from .bench_contact_law import gaussian
+from .bench_contact_law import as_presses_tell, gaussian
 from .harness import Question, Run, with_one_blas_thread
 from .problems import Pressed, fit_model, uneven
 from .rows import Row, grouped, rounded
@@ -157,17 +147,13 @@ class Session:
     ):
         self.rng, self.std = np.random.default_rng([seed, 37]), presses.found.std
         untouched = presses.found.blank(self.rng)
-        self._prepare = partial(prepare_tracker, model, skin.skin, noise=self.std, untouched=untouched)
-        self.tracker, self.depth = self._prepare(), 0.0
-        if probes:
-            shown = [self.shown(presses, number) for number in range(probes)]
-            told = [np.array(part) for part in zip(*shown, strict=True)]
-            self.depth = fit_depth(self.tracker, *told) if spread else 0.0
-            self.tracker = fit_model_error(self.at_depth(self.depth), *told)
-
-    def at_depth(self, depth: float) -> Tracker:
-        """The tracker of a sheet at a depth, m."""
-        return self._prepare(TrackerSettings(loads=LoadSettings(depth=depth))) if depth else self.tracker
+        self.prepare = partial(prepare_tracker, model, skin.skin, noise=self.std, untouched=untouched)
+        shown = [self.shown(presses, number) for number in range(probes)]
+        told = [np.array(part) for part in zip(*shown, strict=True)]
+        if spread and probes:
+            self.tracker = as_presses_tell(self.prepare, *told)
+        else:
+            self.tracker = fit_model_error(self.prepare(), *told) if probes else self.prepare()
 
     def shown(self, presses: Presses, number: int, noise: float = 1.0) -> Shown:
         """A press with so much of the usual noise."""
@@ -250,7 +236,7 @@ def one_shape(run: Run, case: str) -> Iterator[Row]:
 
         def asked(presses: Any, frames: list[Shown], *known: Any, at: Any = (session, given, seed)) -> list[Row]:
             told, tests, own = at
-            about = {"presses": presses, "seed": own, "depth": told.depth}
+            about = {"presses": presses, "seed": own, "depth": told.tracker.field.depth}
             return [about | told.judged(tests, number, one, *known) for number, one in enumerate(frames)]
 
         for number, layer, law in session.taught(teaching, stages):
@@ -258,7 +244,7 @@ def one_shape(run: Run, case: str) -> Iterator[Row]:
         for name, frames in ((KNOWN, shown), (NOISELESS, exact)):
             rows += [row | {"law": False} for row in asked(name, frames, skin.known(session.tracker))]
         own = progress([row for row in rows if row["seed"] == seed])
-        print(f"{case}, skin {seed}, depth {1e3 * session.depth:.1f} mm: {own}", flush=True)
+        print(f"{case}, skin {seed}, depth {1e3 * session.tracker.field.depth:.1f} mm: {own}", flush=True)
     after = grouped(rows, "presses")
     yield {case: [{"load": case} | summary(presses, some, after[0]) for presses, some in after.items()]}
     yield {

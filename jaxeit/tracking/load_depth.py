@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
-import equinox as eqx
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
@@ -14,7 +13,7 @@ from .._compile import require_known
 from ..contacts.loads.spreading import Spreading
 from ..imaging.inputs import InverseError
 from .belief.state import Pads
-from .model_error import press_observations
+from .model_error import press_observations, with_loads
 from .tracker import Tracker
 
 # Depths, m, between which the best one is searched: below a third of the usual width loads are as good as Gaussian. The
@@ -72,11 +71,9 @@ def fit_depth(
 
 
 def _at_depth(tracker: Tracker, depth: float) -> Tracker:
-    settings = replace(tracker.settings, loads=replace(tracker.settings.loads, depth=depth))
+    loads, field = replace(tracker.settings.loads, depth=depth), replace(tracker.field, depth=depth)
     spreading = Spreading.at_depth(depth, tracker.settings.dtype)
-    filters = tracker.filter, tracker.press_filter
-    followed, single = (eqx.tree_at(lambda one: one.sheet.spreading, each, spreading) for each in filters)
-    return Tracker(followed, single, settings, tracker.area, replace(tracker.field, depth=depth))
+    return with_loads(tracker, loads, field, lambda one: one.sheet.spreading, spreading)
 
 
 def _log_probability(tracker: Tracker, observations: Sequence[tuple[np.ndarray, Pads]]) -> float:

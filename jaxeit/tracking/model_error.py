@@ -1,7 +1,9 @@
 """How far the model of a skin errs, from frames in which one contact presses."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,10 +12,12 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from .._compile import require_known
+from ..contacts.loads import LoadSettings
 from ..contacts.loads.learned.model_error import select_model_error
 from ..imaging.inputs import InverseError, require_real
 from ..messages.kinds import require_unmasked
-from .belief.layer import LearnedLayer
+from .belief.contact_filter import ContactFilter
+from .belief.layer import GainField, LearnedLayer
 from .belief.state import Pads
 from .preparation import MESH_ERROR_RATIO
 from .tracker import Tracker
@@ -99,11 +103,18 @@ def press_observations(
 
 
 def _with_model_error(tracker: Tracker, error: float) -> Tracker:
-    settings = replace(tracker.settings, loads=replace(tracker.settings.loads, model_error=error))
-    value = jnp.asarray(error, tracker.filter.model_error.dtype)
-    filters = tracker.filter, tracker.press_filter
-    followed, single = (eqx.tree_at(lambda one: one.model_error, each, value) for each in filters)
+    loads = replace(tracker.settings.loads, model_error=error)
     field = replace(tracker.field, mesh_error=MESH_ERROR_RATIO * error)
+    value = jnp.asarray(error, tracker.filter.model_error.dtype)
+    return with_loads(tracker, loads, field, lambda one: one.model_error, value)
+
+
+def with_loads(
+    tracker: Tracker, loads: LoadSettings, field: GainField, where: Callable[[ContactFilter], Any], value: Any
+) -> Tracker:
+    """A tracker with other settings of loads, whose value is at ``where`` in both of its filters, and another field."""
+    settings = replace(tracker.settings, loads=loads)
+    followed, single = (eqx.tree_at(where, each, value) for each in (tracker.filter, tracker.press_filter))
     return Tracker(followed, single, settings, tracker.area, field)
 
 

@@ -71,12 +71,13 @@ def test_presses_to_which_no_contact_is_fitted_are_named(monkeypatch):
         contact_tracks._with_model_error(FakeTracker(), None)
 
 
-def test_a_sheet_that_no_coat_explains_is_taken_for_even(skin, monkeypatch):
-    """Else its error is in the deviations of the gain that is learned."""
-    asked, untouched = [], np.ones(3)
+@pytest.fixture
+def asked(monkeypatch):
+    """Settings and untouched frames with which trackers are prepared; no coating explains readings below zero."""
+    given = []
 
     def prepare(model, skin, settings, untouched=None, **options):
-        asked.append(untouched)
+        given.append((settings, untouched))
         if untouched is not None and untouched[0] < 0:
             raise je.imaging.InverseError("no coating explains v0")
         return FakeTracker()
@@ -85,36 +86,35 @@ def test_a_sheet_that_no_coat_explains_is_taken_for_even(skin, monkeypatch):
     monkeypatch.setattr(contact_tracks, "_with_model_error", lambda tracker, _: tracker)
     monkeypatch.setattr(contact_tracks, "learned_depth", lambda *_: 0.0)
     monkeypatch.setattr(je, "discretise", lambda *_: None)
+    return given
+
+
+def test_a_sheet_that_no_coat_explains_is_taken_for_even(skin, asked):
+    """Else its error is in the deviations of the gain that is learned."""
+    untouched = np.ones(3)
     calibration = stand_in(Calibration, recon=stand_in(je.Reconstructor, channels=untouched > 0), skin=skin)
     told = []
     for frame in (untouched, -untouched):
         contact_tracks.prepare_calibrated_tracker(calibration, frame, untouched, tell=told.append)
     assert len(told) == 1
     assert told[0].startswith("note: the sheet is taken for even, as the untouched frame shows none that fits: no coat")
-    np.testing.assert_array_equal(asked[0], untouched)
-    np.testing.assert_array_equal(asked[1], -untouched)
-    assert asked[2:] == [None]
+    first, second, *others = [frame for _, frame in asked]
+    np.testing.assert_array_equal(first, untouched)
+    np.testing.assert_array_equal(second, -untouched)
+    assert others == [None]
 
 
-def test_the_depth_that_presses_tell_is_that_of_the_tracker(skin, monkeypatch):
+def test_the_depth_that_presses_tell_is_that_of_the_tracker(skin, asked, monkeypatch):
     """Unless the settings state one."""
-    asked, told, noise = [], [], np.ones(3)
-
-    def prepare(model, skin, settings, **_):
-        asked.append(settings)
-        return FakeTracker()
-
-    monkeypatch.setattr(je.tracking, "prepare_tracker", prepare)
-    monkeypatch.setattr(contact_tracks, "_with_model_error", lambda tracker, _: tracker)
+    told, noise = [], np.ones(3)
     monkeypatch.setattr(contact_tracks, "learned_depth", lambda *_: 0.009)
-    monkeypatch.setattr(je, "discretise", lambda *_: None)
     calibration = stand_in(Calibration, recon=stand_in(je.Reconstructor, channels=noise > 0), skin=skin)
     contact_tracks.prepare_calibrated_tracker(calibration, noise, noise, tell=told.append)
-    assert [settings.loads.depth for settings in asked] == [None, 0.009]
+    assert [settings.loads.depth for settings, _ in asked] == [None, 0.009]
     assert told == ["presses of the calibration spread as at a depth of 9.0 mm in an elastic half-space"]
     flat = TrackerSettings(loads=LoadSettings(depth=0.0))
     contact_tracks.prepare_calibrated_tracker(calibration, noise, noise, flat, told.append)
-    assert asked[2:] == [flat]
+    assert [settings for settings, _ in asked[2:]] == [flat]
 
 
 def test_a_layer_keeps_the_depth_under_which_it_was_learned(monkeypatch):

@@ -7,8 +7,9 @@ import pytest
 
 from benchmarks.bench_learning import DEPTH, GAUSSIAN, HALF_SPACE, Session, Skin
 from benchmarks.problems import fit_model
+from jaxeit.contacts import LoadSettings
 from jaxeit.imaging import InverseError
-from jaxeit.tracking import LearnedLayer, fit_depth
+from jaxeit.tracking import LearnedLayer, TrackerSettings, fit_depth
 
 PRESSES = 12
 SEED = 9600
@@ -40,7 +41,7 @@ def test_gaussian_loads_have_no_depth(pressed):
 def test_at_its_depth_contacts_are_nearer_to_where_they_are(pressed):
     """Half as far on this skin, at least."""
     session, presses, frames = pressed[HALF_SPACE]
-    deep = session.at_depth(DEPTH)
+    deep = session.prepare(TrackerSettings(loads=LoadSettings(depth=DEPTH)))
     far, near = (
         np.mean([
             np.linalg.norm(tracker.press(*one).tracks[0].position - place)
